@@ -1,9 +1,9 @@
 """The paper's tables from directories of runs."""
 
 from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.evaluation.tables.assemble import build_tables
+from ghgs_lit.evaluation.tables.build import build_tables
 from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Table, TableOptions
-from ghgs_lit.evaluation.tables.records import read_others, read_sweep
+from ghgs_lit.evaluation.tables.runs import read_others, read_sweep
 from ghgs_lit.evaluation.tables.writers import PREAMBLE, to_csv, to_latex, to_markdown, to_terminal
 
 __all__ = [

@@ -1,32 +1,27 @@
 """Cells of a table: means, deviations, the best value, and significant differences."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, product
-from typing import Any
 
 import pandas as pd
 
 from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
-from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of
-from ghgs_lit.evaluation.tables.records import TRAINING, person_of
+from ghgs_lit.errors import InputError, choice
+from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of, paper
+from ghgs_lit.evaluation.tables.runs import ABSENT, TRAINING, describe, differing
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
-from ghgs_lit.evaluation.tables.variants import ABSENT, differing, differing_text
 
 
-def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
+def fill(table: Table) -> None:
     """Fill the cells of a table.
 
     Args:
         table: With rows, lines, groups and metrics; gets ``cells`` and ``comparisons``.
-        figures: Reported cells, each with ``line``, ``group``, ``metric`` and ``mean``.
 
     Raises:
-        InputError: Runs with other numbers claim one cell and seed,
-            or configurations in a cell differ.
+        InputError: Runs with other numbers claim one cell and seed, or configurations in a cell differ.
     """
     values = _values(table)
     _refuse_rivals(table, values)
@@ -37,50 +32,40 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
     seeds = seeds.agg(mean=("value", "mean"), count=("count", "first"), run=("run", "first")).reset_index()
     means = {"mean": ("mean", "mean"), "deviation": ("mean", "std"), "seeds": ("seed", tuple)}
     cells = seeds.groupby(CELL).agg(**means, count=("count", "first"), runs=("run", " ".join))
-    columns = list(product(range(len(table.groups)), table.metrics))
-    every = [(line, *column) for line in range(len(table.lines)) for column in columns]
-    cells = cells.reindex(pd.MultiIndex.from_tuples(every, names=CELL))
-    reported = pd.DataFrame(figures, columns=[*CELL, "mean"]).set_index(CELL)
-    table.cells = cells.assign(
-        mean=cells["mean"].fillna(reported["mean"]), best=False, marked=False, test=None
-    )
-    table.cells["lacking"] = _lacking(table)
-    for column in columns:
-        _mark_best(table, column)
+    shape = (range(len(table.lines)), range(len(table.groups)), table.metrics)
+    cells = cells.reindex(pd.MultiIndex.from_product(shape, names=CELL))
+    cells["mean"] = cells["mean"].fillna(_reported(table))
+    cells["lacking"] = _lacking(table, cells["seeds"])
+    table.cells = cells.assign(best=False, marked=False, test=None)
+    # Without baselines, some of which know the truth.
+    competing = [i for i, line in enumerate(table.lines) if line.variant.kind in ("model", "other")]
+    competing = cells["mean"].dropna().loc[lambda means: means.index.isin(competing, level="line")]
+    for column, means in competing.groupby(CELL[1:]):
+        _mark_best(table, means.round(metric_of(column[1]).decimals), metric_of(column[1]).arrow)
     if table.options.test.against != "none":
-        _test(table, _by_person(values, table.options.unit), table.options.test)
-
-
-def _line_of(table: Table) -> dict[Any, int]:
-    """Numbers of the measured lines by variant."""
-    return {line.variant: i for i, line in enumerate(table.lines) if line.variant.kind != "reported"}
+        for name in table.tested:
+            choice("test.metrics", name, tuple(table.metrics))
+        _test(table, _by_person(table, values), competing)
 
 
 def _values(table: Table) -> pd.DataFrame:
-    """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``,
-    ``value``."""
-    lines = _line_of(table)
-    has_data = table.layout.columns == "data"
-    groups = {(group.views, group.data): i for i, group in enumerate(table.groups)}
+    """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
     rows = table.rows
-    about = zip(rows["views"], rows["data"], strict=True)
-    numbers = [groups.get((views, data_title(data) if has_data else None), -1) for views, data in about]
+    lines = {line.variant: i for i, line in enumerate(table.lines) if line.variant.kind != "reported"}
+    groups = {(group.views, group.data): i for i, group in enumerate(table.groups)}
+    titles = rows["data"].map(data_title) if table.layout.columns == "data" else [None] * len(rows)
+    numbers = [groups.get(key, -1) for key in zip(rows["views"], titles, strict=True)]
     rows = rows.assign(line=[lines[variant] for variant in rows["variant"]], group=numbers)
     rows = rows[rows["group"] >= 0]
     size = rows.groupby(["line", "group", "seed", "source"])["line"].transform("size")
     rows = rows.assign(count=rows.get("count", size).fillna(size), run=rows["run"].fillna(rows["source"]))
     facts = ["line", "group", "seed", "source", "run", "subject", "count"]
-    return (
-        rows.reindex(columns=[*facts, *table.metrics]).melt(facts, var_name="metric").dropna(subset="value")
-    )
+    rows = rows.reindex(columns=[*facts, *table.metrics])
+    return rows.melt(facts, var_name="metric").dropna(subset="value")
 
 
 def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
-    """Refuse several runs for one cell and seed, and runs of different configurations in one cell.
-
-    Raises:
-        InputError: Names the runs, and the keys in which they differ.
-    """
+    """Refuse several runs for one cell and seed, and runs of different configurations in one cell."""
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
         if part["value"].nunique() > 1:
@@ -102,102 +87,103 @@ def _rivals(table: Table, cell: tuple[int, int], sources: Sequence[str], expecte
     """The error that runs claim one cell, with the keys of ``by`` that give each a row."""
     variant = table.lines[cell[0]].variant
     row = f"ablation={variant.ablation}" if variant.ablation else variant.name
-    expected %= f"{row}, {table.groups[cell[1]].views} views"
     keys = _differing(table, sources)
-    cure = f"they differ in {differing_text(keys)}: by=[{','.join(keys)}] gives each a row"
-    cure = cure if keys else "their configurations are equal"
-    found = " and ".join(sources)
-    return InputError(f"runs: expected {expected}; found {found}; {cure}; runs=[...] lists those to show")
+    cure = f"they differ in {describe(keys)}: by=[{','.join(keys)}] gives each a row"
+    return InputError(
+        f"runs: expected {expected % f'{row}, {table.groups[cell[1]].views} views'}; found"
+        f" {' and '.join(sources)}; {cure if keys else 'their configurations are equal'};"
+        " runs=[...] lists those to show"
+    )
 
 
-def _lacking(table: Table) -> list[tuple[int, ...]]:
+def _reported(table: Table) -> pd.Series:
+    """The paper's figures by ``CELL``."""
+    figures = {}
+    for number, line in enumerate(table.lines):
+        if line.variant.kind != "reported":
+            continue
+        row = paper()["tables"][table.layout.reported]["rows"][line.variant.name]
+        by_group = {data_title(key) if isinstance(key, str) else key: values for key, values in row.items()}
+        for i, group in enumerate(table.groups):
+            # The paper does not report with how many views its Table 1 was measured.
+            values = by_group.get(group.data or group.views, [])
+            figures |= {(number, i, name): x for name, x in zip(paper()["metrics"], values, strict=False)}
+    return pd.Series(figures, dtype=float)
+
+
+def _lacking(table: Table, measured: pd.Series) -> list[tuple[int, ...]]:
     """Seeds of planned runs without results that would fill each cell."""
-    lines = _line_of(table)
-    planned: dict[tuple[int, int], set[int]] = {}
+    planned = defaultdict(set)
     for run, (number, group) in product(table.planned, enumerate(table.groups)):
-        fits_views = run.views is None or group.views in run.views
-        if fits_views and group.data in (None, data_title(run.data)):
-            planned.setdefault((lines[run.variant], number), set()).add(run.seed)
+        if (run.views is None or group.views in run.views) and group.data in (None, data_title(run.data)):
+            planned[run.variant, number].add(run.seed)
     lacking = []
-    for (line, group, _), seeds in table.cells["seeds"].items():
-        measured = seeds if isinstance(seeds, tuple) else ()
-        lacking.append(tuple(sorted(planned.get((line, group), set()).difference(measured))))
+    for (line, group, _), seeds in measured.items():
+        known = seeds if isinstance(seeds, tuple) else ()
+        lacking.append(tuple(sorted(planned[table.lines[line].variant, group].difference(known))))
     return lacking
 
 
-def _competing(table: Table, column: tuple) -> pd.Series:
-    """Means of a column by line, without baselines, some of which know the truth."""
-    means = table.cells["mean"].xs(column, level=CELL[1:]).dropna()
-    return means[[table.lines[i].variant.kind in ("model", "other") for i in means.index]]
-
-
-def _mark_best(table: Table, column: tuple) -> None:
+def _mark_best(table: Table, means: pd.Series, arrow: str) -> None:
     """Mark the best means of a column, as printed. None is marked if all are equal, no direction is
     better, or the best leads by no more than the larger deviation over seeds of the best two."""
-    metric = metric_of(column[1])
-    means = _competing(table, column).round(metric.decimals)
-    if means.nunique() < 2 or not metric.arrow:
+    if means.nunique() < 2 or not arrow:
         return
-    means = means.sort_values(ascending=metric.arrow == "↓")
-    deviations = table.cells["deviation"].xs(column, level=CELL[1:])[means.index[:2]]
-    if abs(means.iloc[0] - means.iloc[1]) <= deviations.max():  # false if there is no deviation
-        return
-    for line in means.index[means == means.iloc[0]]:
-        table.cells.loc[(line, *column), "best"] = True
+    means = means.sort_values(ascending=arrow == "↓")
+    deviations = table.cells["deviation"][means.index[:2]]
+    if not abs(means.iloc[0] - means.iloc[1]) <= deviations.max():  # false if there is no deviation
+        table.cells.loc[means.index[means == means.iloc[0]], "best"] = True
 
 
-def _by_person(values: pd.DataFrame, unit: re.Pattern[str] | None) -> pd.DataFrame:
+def _by_person(table: Table, values: pd.DataFrame) -> pd.DataFrame:
     """Values that can be tested, by cell and seed (index) and by person (columns)."""
     values = values[values["subject"].notna() & ~values["metric"].isin(TRAINING)]
-    values = values.assign(person=[person_of(subject, unit) for subject in values["subject"]])
+    person = values["subject"]
+    if table.options.unit:
+        matches = [table.options.unit.fullmatch(name) for name in person]
+        person = [match[1] if match else name for match, name in zip(matches, person, strict=True)]
+    values = values.assign(person=person)
     return values.groupby([*CELL, "seed", "person"])["value"].mean().unstack("person")
 
 
-def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
-    """Test each row against the reference of its column, corrected over all comparisons of the
-    table. If the reference was chosen by its figures, every pair of rows of the column counts as a
-    comparison."""
-    tested: list[tuple[tuple | None, Comparison]] = []
+def _test(table: Table, people: pd.DataFrame, competing: pd.Series) -> None:
+    """Test each row against the reference of its column, corrected over all comparisons of the table.
+    If the reference was chosen by its figures, every pair of rows of the column counts as a comparison."""
+    alpha = table.options.test.alpha
+    competing = competing[competing.index.isin(people.index.droplevel("seed"))]
+    tests: dict[tuple, Comparison] = {}
+    unprinted = []
     for column in product(range(len(table.groups)), table.tested):
-        means = _competing(table, column)
-        means = means[[(line, *column) in people.index.droplevel("seed") for line in means.index]]
-        reference, chosen = _reference(table, means, column[1], test.against)
+        means = competing[[cell[1:] == column for cell in competing.index]]
+        reference, is_chosen = _reference(table, means)
         if reference is None:
             continue
-        rows = {line: people.loc[(line, *column)] for line in means.index}
+        rows = {cell: people.loc[cell] for cell in means.index}
         pooled = pool(list(rows.values()))
-        for one, other in combinations(rows, 2):
-            if reference in (one, other) or chosen:
-                row, against = (other, one) if one == reference else (one, other)
-                cell = (row, *column) if against == reference else None
-                tested.append((cell, compare(rows[row], rows[against], test.alpha, pooled)))
-    known = [comparison.p for _, comparison in tested if comparison.p is not None]
-    table.comparisons = len(known)
-    corrected = iter(holm(known))
-    for cell, comparison in tested:
-        if comparison.p is not None:
-            smallest = smallest_difference(comparison, test.alpha, len(known))
-            comparison = replace(comparison, corrected=next(corrected), smallest=smallest)
-        if cell is not None:
-            table.cells.at[cell, "test"] = comparison
-            table.cells.at[cell, "marked"] = comparison.p is not None and comparison.corrected < test.alpha
+        rest = [cell for cell in rows if cell != reference]
+        for cell in rest:
+            tests[cell] = compare(rows[cell], rows[reference], alpha, pooled)
+        for pair in combinations(rest, 2) if is_chosen else ():
+            unprinted.append(compare(*(rows[cell] for cell in pair), alpha, pooled).p)
+    known = [cell for cell, test in tests.items() if test.p is not None]
+    corrected = holm([tests[cell].p for cell in known] + [p for p in unprinted if p is not None])
+    table.comparisons = len(corrected)
+    for cell, p in zip(known, corrected, strict=False):
+        smallest = smallest_difference(tests[cell], alpha, len(corrected))
+        tests[cell] = replace(tests[cell], corrected=p, smallest=smallest)
+        table.cells.at[cell, "marked"] = p < alpha
+    for cell, test in tests.items():
+        table.cells.at[cell, "test"] = test
 
 
-def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tuple[int | None, bool]:
-    """Number of the reference row of a column, None without any, and whether it was chosen by its
-    figures.
-
-    Args:
-        table: With lines.
-        means: Means of the rows that compete, by number of the line.
-        metric: Of the column.
-        against: ``full``: the row of the whole method, where there is one;
-            ``best``: the best of the column.
-    """
-    full = [i for i in means.index if table.lines[i].variant.ablation == "full"]
-    if against == "full" and len(full) == 1:
+def _reference(table: Table, means: pd.Series) -> tuple[tuple | None, bool]:
+    """The cell with which the others of a column are compared (None: there is none): that of the whole
+    method where it has one row and ``test.against`` is ``full``, else the best; and whether it was chosen
+    by its figures."""
+    full = [cell for cell in means.index if table.lines[cell[0]].variant.ablation == "full"]
+    if table.options.test.against == "full" and len(full) == 1:
         return full[0], False
-    arrow = metric_of(metric).arrow
-    if means.empty or not arrow:
+    arrow = metric_of(means.index[0][2]).arrow if len(means) else ""
+    if not arrow:
         return None, False
     return (means.idxmin() if arrow == "↓" else means.idxmax()), True

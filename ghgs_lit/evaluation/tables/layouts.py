@@ -1,5 +1,4 @@
-"""Layouts of tables (the paper's four, the ablation at several numbers of views) and
-their parts."""
+"""Layouts of tables (the paper's four, the ablation at several numbers of views) and their parts."""
 
 import re
 from collections.abc import Mapping
@@ -11,20 +10,12 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.errors import choice
-from ghgs_lit.evaluation.tables.records import TRAINING, Planned
-from ghgs_lit.evaluation.tables.variants import Variant
+from ghgs_lit.evaluation.tables.runs import Planned, Variant
 from ghgs_lit.parsing import read_yaml
 
 
 class Metric(NamedTuple):
-    """How a metric is printed.
-
-    Attributes:
-        title: Of its columns.
-        decimals: As in the paper.
-        arrow: ↑: higher is better; ↓: lower; empty: neither, or not known.
-    """
+    """How a metric is printed; the arrow is ↑ where higher is better, ↓ where lower, else empty."""
 
     title: str
     decimals: int
@@ -51,22 +42,13 @@ METRICS = {
 
 
 def metric_of(name: str) -> Metric:
-    """How a metric is printed.
-
-    Args:
-        name: With its region, such as ``psnr_box``.
-
-    Returns:
-        Its entry of ``METRICS``, else that of the metric without its region.
-    """
+    """How a metric such as ``psnr_box`` is printed: its entry, else that of the metric without its region."""
     stem, _, region = name.partition("_")
-    unknown = Metric(stem.upper(), 4, "")
-    known = METRICS.get(stem, unknown)
+    known = METRICS.get(stem, Metric("", 4, ""))
     return METRICS.get(name) or known._replace(title=f"{stem.upper()} {region}".strip())
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """Rows and groups of columns of a table.
 
     Attributes:
@@ -75,7 +57,7 @@ class Layout:
         columns: One group for each of ``views`` or ``data``.
         views: Numbers of input views that are shown.
         heading: Of each group: ``views``, ``data`` or ``none``.
-        reported: The paper's table whose figures are shown beside the measured ones; None: none.
+        reported: The paper's table whose figures are shown next to the measured ones; None: none.
     """
 
     name: str
@@ -121,8 +103,7 @@ class TableOptions:
 
 
 class Group(NamedTuple):
-    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views``
-    input views."""
+    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views`` input views."""
 
     title: str
     views: int
@@ -137,8 +118,7 @@ class Line(NamedTuple):
 
 
 CELL = ["line", "group", "metric"]
-"""What tells the cells of a table apart: numbers of the line and of the group of columns,
-and the metric."""
+"""What identifies a cell: numbers of the line and of the group of columns, and the metric."""
 
 
 @dataclass
@@ -154,15 +134,16 @@ class Table:
         groups: Groups of columns.
         metrics: Names of the metrics of each group.
         lines: Rows of the table.
+        left_out: Number of runs that the table does not show.
+        reported_on: Data of the reported figures, if any.
         cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over
             seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples,
             ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed),
             ``test`` (a :class:`Comparison` or None), ``marked`` (significant).
+        tested: Names of the metrics that are tested.
+        comparisons: Number of comparisons that are corrected together.
         caption: Above the table.
         notes: Below the table.
-        reported_on: Data of the reported figures, if any.
-        comparisons: Number of comparisons that are corrected together.
-        others: Number of runs that the table does not show.
     """
 
     options: TableOptions
@@ -173,65 +154,34 @@ class Table:
     groups: list[Group]
     metrics: list[str]
     lines: list[Line]
+    left_out: int
+    reported_on: str | None = None
     cells: pd.DataFrame = field(default_factory=pd.DataFrame)
+    tested: list[str] = field(default_factory=list)
+    comparisons: int = 0
     caption: str = ""
     notes: list[str] = field(default_factory=list)
-    reported_on: str | None = None
-    comparisons: int = 0
-    others: int = 0
 
     @property
     def layout(self) -> Layout:
         return self.options.layout
 
     @property
-    def tested(self) -> list[str]:
-        """Metrics that are tested: the option's, else the first that subjects have.
-
-        Raises:
-            InputError: The option names a metric that the table lacks.
-        """
-        chosen = self.options.test.metrics
-        if chosen is None:
-            return [name for name in self.metrics if name not in TRAINING][:1]
-        names = (chosen,) if isinstance(chosen, str) else chosen
-        for name in names:
-            choice("test.metrics", name, tuple(self.metrics))
-        return list(names)
-
-    @property
-    def ours(self) -> list[Variant]:
-        """Variants of our models, by row."""
-        return [line.variant for line in self.lines if line.variant.kind == "model"]
+    def is_ablation(self) -> bool:
+        return self.layout.rows == "ablation"
 
     @property
     def measured(self) -> pd.DataFrame:
         """Cells with a measured, not reported, number."""
         return self.cells[self.cells["seeds"].notna()]
 
-    @property
-    def blocks(self) -> dict[str, list[int]]:
-        """Numbers of the reported lines, then of the measured ones, by title; none is empty."""
-        reported = [i for i, line in enumerate(self.lines) if line.variant.kind == "reported"]
-        measured = [i for i in range(len(self.lines)) if i not in reported]
-        titles = (f"as reported on {self.reported_on}, not measured here", "measured here")
-        blocks = dict(zip(titles, (reported, measured), strict=True))
-        return {title: block for title, block in blocks.items() if block}
-
 
 @cache
 def paper() -> dict[str, Any]:
     """What the paper's tables print, as in ``reported.yaml``."""
-    return read_yaml(Path(__file__).parent / "reported.yaml")
+    return read_yaml(Path(__file__).with_name("reported.yaml"))
 
 
 def data_title(name: str) -> str:
-    """The paper's name of a data set.
-
-    Args:
-        name: In any spelling, such as ``zju_mocap``.
-
-    Returns:
-        Its name in the paper, else ``name``.
-    """
+    """The paper's name of a data set in any spelling, such as ``zju_mocap``; else ``name``."""
     return paper()["data"].get(re.sub(r"[^a-z0-9]", "", name.lower()), name)

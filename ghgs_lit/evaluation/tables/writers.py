@@ -3,8 +3,9 @@ r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
 LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
 
+import itertools
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -51,56 +52,53 @@ def _texts(table: Table, write: Write) -> pd.DataFrame:
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
+def _blocks(table: Table, write: Write) -> list[tuple[str, list[tuple[str, list[str]]]]]:
+    """Reported lines, then measured ones: a title and, for each line, its kind and cells; none is empty."""
+    numbers = _texts(table, write)
+    titles = {True: f"as reported on {table.reported_on}, not measured here", False: "measured here"}
+    blocks = []
+    for is_reported, title in titles.items():
+        lines = [
+            (line.variant.kind, [*line.stub, *numbers.loc[i]])
+            for i, line in enumerate(table.lines)
+            if (line.variant.kind == "reported") == is_reported
+        ]
+        blocks += [(title, lines)] * bool(lines)
+    return blocks
+
+
 def to_markdown(table: Table) -> str:
-    """The table with its caption above and its notes below.
+    """The table as Markdown, with its caption above and its notes below."""
 
-    Args:
-        table: With its cells.
+    def write(number: str, tail: str, best: bool) -> str:
+        text = number + tail.replace(MARK, rf"\{MARK}")
+        return f"**{text}**" if best else text
 
-    Returns:
-        Markdown.
-    """
-    numbers = _texts(table, lambda number, tail, best: _bold(number + tail.replace(MARK, rf"\{MARK}"), best))
-    names = [*table.stub, *(_heading(table, *column) for column in numbers)]
+    width = len(table.groups) * len(table.metrics)
+    names = list(table.stub)
+    for group, metric in itertools.product(table.groups, map(metric_of, table.metrics)):
+        title = f"{metric.title} {metric.arrow}".strip()
+        names.append(f"{group.title} {title}" if table.layout.heading != "none" else title)
     rows = []
-    for title, block in table.blocks.items():
+    for title, lines in _blocks(table, write):
         if table.reported_on:
             rows.append([f"*{title}*", *[""] * (len(names) - 1)])
-        rows += [[*table.lines[i].stub, *numbers.loc[i]] for i in block]
-    align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * numbers.shape[1]
+        rows += [cells for _, cells in lines]
+    align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * width
     text = tabulate(rows, names, "pipe", colalign=align, disable_numparse=True)
     notes = [rf"\{note}" if note.startswith(MARK + " ") else note for note in table.notes]
     return "\n\n".join((table.caption, text, *notes)) + "\n"
 
 
-def _bold(text: str, best: bool) -> str:
-    return f"**{text}**" if best else text
-
-
-def _heading(table: Table, group: int, metric: str) -> str:
-    """Title of a column, such as ``4-view PSNR ↑``."""
-    title = f"{metric_of(metric).title} {metric_of(metric).arrow}".strip()
-    return f"{table.groups[group].title} {title}" if table.layout.heading != "none" else title
-
-
 def to_terminal(table: Table) -> str:
-    """The table for a terminal: each group of columns has lines of its own,
-    so that no table is wide.
-
-    Args:
-        table: With its cells.
-
-    Returns:
-        Plain text with caption and notes.
-    """
+    """The table for a terminal, with caption and notes; each group of columns has its own lines, so that
+    no table is wide."""
     numbers = _texts(table, lambda number, tail, best: number + tail + BEST * best)
     rows = []
-    for i, line in enumerate(table.lines):
+    for (i, line), (number, group) in itertools.product(enumerate(table.lines), enumerate(table.groups)):
         mark = "† " if line.variant.kind == "reported" else ""
-        for number, group in enumerate(table.groups):
-            rows.append([mark + line.stub[0], *line.stub[1:], group.title, *numbers.loc[i][number]])
-    metrics = map(metric_of, table.metrics)
-    names = [*table.stub, "", *(f"{metric.title} {metric.arrow}" for metric in metrics)]
+        rows.append([mark + line.stub[0], *line.stub[1:], group.title, *numbers.loc[i][number]])
+    names = [*table.stub, "", *("{0} {2}".format(*metric_of(name)) for name in table.metrics)]
     text = tabulate(rows, names, disable_numparse=True)
     caption = table.caption.replace("in bold", f"marked{BEST}")
     text = "\n\n".join((caption, text, *table.notes)) + "\n"
@@ -108,19 +106,11 @@ def to_terminal(table: Table) -> str:
 
 
 def to_csv(tables: Sequence[Table]) -> str:
-    """All cells with all digits, one on each line; the mean is empty if a run is missing.
-
-    Args:
-        tables: With their cells.
-
-    Returns:
-        CSV with the columns ``COLUMNS``.
-    """
+    """All cells with all digits, a line each, by ``COLUMNS``; the mean is empty if a run is missing."""
     lines = []
     for number, table in enumerate(tables, 1):
         for cell in table.cells.itertuples():
-            about = {"table": number, **_about_row(table, cell)}
-            lines.append(about if pd.isna(cell.mean) else about | _figures(table, cell))
+            lines.append({"table": number, **_about_row(table, cell), **_figures(table, cell)})
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
@@ -135,7 +125,7 @@ def _about_row(table: Table, cell: Any) -> dict[str, Any]:
     unprojection, semantic = variant.switches or (None, None)
     return {
         "kind": variant.kind,
-        "method": stub[0] if table.layout.rows == "methods" else "ours",
+        "method": "ours" if table.is_ablation else stub[0],
         "model": variant.model,
         "encoder": variant.encoder,
         "ablation": variant.ablation,
@@ -150,7 +140,9 @@ def _about_row(table: Table, cell: Any) -> dict[str, Any]:
 
 
 def _figures(table: Table, cell: Any) -> dict[str, Any]:
-    """Figures of a cell, by column."""
+    """Figures of a cell, by column; none where there is no number."""
+    if pd.isna(cell.mean):
+        return {}
     figures = {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
     if isinstance(cell.seeds, tuple):  # measured, not reported
         figures |= {
@@ -192,26 +184,12 @@ _ESCAPES = {
 
 
 def escape(text: str) -> str:
-    """Plain text as LaTeX.
-
-    Args:
-        text: Any.
-
-    Returns:
-        The same with escaped characters.
-    """
+    """Plain text as LaTeX."""
     return text.translate(str.maketrans(_ESCAPES))
 
 
 def prose(text: str) -> str:
-    """Markdown as LaTeX.
-
-    Args:
-        text: With ``**bold**`` and names in backticks.
-
-    Returns:
-        LaTeX.
-    """
+    """Markdown with ``**bold**`` and names in backticks as LaTeX."""
     text = re.sub(r"\*\*([^*]+)\*\*", r"\\textbf{\1}", escape(text))
     return re.sub(r"`([^`]*)`", r"\\texttt{\1}", text)
 
@@ -222,17 +200,12 @@ def _number(number: str, tail: str, best: bool) -> str:
 
 
 def _columns(table: Table) -> str:
-    """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for
-    data sets)."""
-    if table.layout.rows == "ablation" and len(table.groups) == 1:
+    """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for data sets)."""
+    if table.is_ablation and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = " ".join("c" * len(table.stub)) if len(table.stub) > 1 else "l"
     columns = " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
     return columns.replace(" |", "", 1) if table.layout.columns == "data" else columns
-
-
-def _row(cells: Iterable[str]) -> str:
-    return " & ".join(cells) + r" \\"
 
 
 def _head(table: Table) -> list[str]:
@@ -242,43 +215,37 @@ def _head(table: Table) -> list[str]:
     metrics = []
     for metric in map(metric_of, table.metrics):
         metrics.append(escape(metric.title) + (f"({escape(metric.arrow)})" if metric.arrow else ""))
+    metrics *= len(table.groups)
     if table.layout.heading == "none":
-        return [_row([*stub, *metrics * len(table.groups)])]
+        return [" & ".join([*stub, *metrics]) + r" \\"]
     names = [rf"\multirow{{2}}{{*}}{{{name}}}" for name in stub]
-    groups = [rf"\multicolumn{{{width}}}{{c}}{{{escape(group.title)}}}" for group in table.groups]
-    starts = [len(stub) + 1 + i * width for i in range(len(groups))]
-    rules = "".join(rf"\cmidrule(lr){{{start}-{start + width - 1}}}" for start in starts)
-    return [_row([*names, *groups]), rules, _row([*[""] * len(stub), *metrics * len(groups)])]
+    rules = ""
+    for number, group in enumerate(table.groups):
+        names.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(group.title)}}}")
+        start = len(stub) + 1 + number * width
+        rules += rf"\cmidrule(lr){{{start}-{start + width - 1}}}"
+    return [" & ".join(names) + r" \\", rules, " & ".join([*[""] * len(stub), *metrics]) + r" \\"]
 
 
 def _tabular(table: Table) -> str:
     """The ``tabular`` environment, with rules above blocks."""
-    numbers = _texts(table, _number)
     rows = [rf"\begin{{tabular}}{{{_columns(table)}}}", r"\toprule", *_head(table)]
-    for title, block in table.blocks.items():
+    count = len(table.stub)
+    for title, lines in _blocks(table, _number):
         rows.append(r"\midrule")
         if table.reported_on:
-            count = len(table.stub) + numbers.shape[1]
-            rows += [rf"\multicolumn{{{count}}}{{l}}{{\emph{{{escape(title)}}}}} \\", r"\midrule"]
-        for line in block:
-            variant, stub = table.lines[line]
-            names = list(map(escape, stub))
-            if variant.kind == "model" and table.layout.rows == "methods":
+            title = rf"\multicolumn{{{len(lines[0][1])}}}{{l}}{{\emph{{{escape(title)}}}}} \\"
+            rows += [title, r"\midrule"]
+        for kind, cells in lines:
+            names = list(map(escape, cells[:count]))
+            if kind == "model" and not table.is_ablation:
                 names = [rf"\textbf{{{name}}}" for name in names]
-            rows.append(_row([*names, *numbers.loc[line]]))
+            rows.append(" & ".join([*names, *cells[count:]]) + r" \\")
     return "\n".join([*rows, r"\bottomrule", r"\end{tabular}"])
 
 
 def to_latex(table: Table, label: str) -> str:
-    """A float with the table, its caption, notes in small print and label.
-
-    Args:
-        table: With its cells.
-        label: Of the float.
-
-    Returns:
-        LaTeX, which needs the packages of ``PREAMBLE``.
-    """
+    """A float with the table, its caption, notes in small print and label; needs ``PREAMBLE``."""
     notes = "\n".join(rf"{prose(note)}\par" for note in table.notes)
     parts = {
         "float": "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table",

@@ -1,4 +1,4 @@
-"""Assembly of tables from measurements: their rows, columns and cells."""
+"""Assembly of tables from measurements: which runs they show, and their rows and columns."""
 
 import itertools
 import re
@@ -12,8 +12,7 @@ from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table, TableOptions, data_title, paper
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
-from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep
-from ghgs_lit.evaluation.tables.variants import Variant
+from ghgs_lit.evaluation.tables.runs import SETTING, TRAINING, Planned, Sweep, Variant
 
 BASELINES = {
     "black": "Black image",
@@ -31,12 +30,11 @@ PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
 _KINDS = ("baseline", "other", "model")
 #: Columns of measurements that are no metrics.
 _FACTS = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject"}
-_FACTS |= {"count", "said", "trained"}
+_FACTS |= {"count", "origin", "trained"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """Tables of the measurements of a sweep: one for each setting,
-    and for each model if rows are ablations.
+    """Tables of the measurements of a sweep: one for each setting, and for each model if rows are ablations.
 
     Args:
         sweep: Runs of ours.
@@ -71,26 +69,30 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         rows["trained"] = [variant.trained for variant in rows["variant"]]
         same.append("trained")
     parts = [part for _, part in rows.groupby(same, sort=False) if part.index[0] < len(ours)]
-    for theirs in others:
-        if not any(theirs["source"].isin(part["source"]).any() for part in parts):
-            keys = [_text(part, same) for part in parts]
-            source = theirs["source"].iloc[0]
-            raise InputError(f"{source}: expected results on one of {keys}; found {_text(theirs, same)}")
+    shown = set().union(*(part["source"] for part in parts))
+    for source, theirs in rows[len(ours) :].groupby("source", sort=False):
+        if source not in shown:
+            keys = [_describe(part, same) for part in parts]
+            raise InputError(f"{source}: expected results on one of {keys}; found {_describe(theirs, same)}")
     return [_table(part, sweep, options) for part in parts]
 
 
-def _text(rows: pd.DataFrame, names: list[str]) -> str:
+def _describe(rows: pd.DataFrame, names: list[str]) -> str:
     return ", ".join(f"{name}={rows.iloc[0][name]}" for name in names)
+
+
+def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
+    """Rows of the subjects whose whole names match, and means, which have no subject."""
+    is_kept = rows["subject"].isna() | rows["subject"].str.fullmatch(names).eq(True)
+    expected = f"a match with the whole name of a subject of {where}, such as {rows['subject'].iloc[0]}"
+    require(is_kept.any(), "subjects", expected, names.pattern)
+    return rows[is_kept]
 
 
 def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
     """The runs that a layout shows, of those of all layouts in a folder: with its numbers of views; on
     the paper's data, if any are; no baselines among ablations, and none of the paper's ablations
-    among methods.
-
-    Raises:
-        InputError: There are none.
-    """
+    among methods."""
     layout = options.layout
     views = options.views or layout.views
     rows = sweep.rows[sweep.rows["views"].isin(views)]
@@ -117,45 +119,36 @@ def _reported_data(layout: Layout) -> list[str]:
     return paper()["tables"][layout.reported]["data"].split(" and ") if layout.reported else []
 
 
-def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
-    """Rows of the subjects whose whole names match, and means, which have no subject.
-
-    Raises:
-        InputError: None matches.
-    """
-    is_kept = [not isinstance(name, str) or names.fullmatch(name) is not None for name in rows["subject"]]
-    expected = f"a match with the whole name of a subject of {where}, such as {rows['subject'].iloc[0]}"
-    require(any(is_kept), "subjects", expected, names.pattern)
-    return rows[is_kept]
-
-
 def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     layout = options.layout
     is_ablation = layout.rows == "ablation"
     trained = {variant.trained for variant in rows["variant"]}
     planned = [run for run in sweep.planned if layout.columns == "data" or run.data in set(rows["data"])]
     planned = [run for run in planned if not is_ablation or run.variant.trained in trained]
-    groups = _groups(rows, planned, options)
     models = rows[[variant.kind == "model" for variant in rows["variant"]]]
     models = rows if models.empty else models
     has_lpips = "lpips" in models and models.groupby("source")["lpips"].count().all()
     metrics = list(options.metrics or ("psnr", "ssim", "lpips" if has_lpips else "flip"))
     place = {variant: i for i, variant in enumerate(sweep.order)}
-    begun = dict.fromkeys([*rows["variant"], *(run.variant for run in planned)])
-    begun = sorted(begun, key=lambda v: (_KINDS.index(v.kind), place.get(v, len(place))))
+    variants = dict.fromkeys([*rows["variant"], *(run.variant for run in planned)])
+    variants = sorted(variants, key=lambda v: (_KINDS.index(v.kind), place.get(v, len(place))))
     stub = ("3D Unproj.", "Semantic Cons.") if is_ablation else ("Methods",)
-    lines = _ablation_lines(begun) if is_ablation else _method_lines(begun)
-    table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines)
-    figures: list[dict] = []
+    lines = _ablation_lines(variants) if is_ablation else _method_lines(variants)
+    groups = _groups(rows, planned, options)
+    left_out = len(sweep.configs.keys() - set(sweep.rows["source"]))
+    table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, left_out)
     if layout.reported and options.reported:
         table.reported_on = paper()["tables"][layout.reported]["data"]
-        reported, figures = _reported(layout, groups)
-        table.lines = [*reported, *lines]
-    if is_ablation and any(variant.is_own for variant in begun):
+        table.lines = [*_reported_lines(layout), *lines]
+    if is_ablation and any(variant.is_own for variant in variants):
         table.stub = ("Ablation", *stub)
         table.lines = [line._replace(stub=(line.variant.ablation, *line.stub)) for line in table.lines]
-    table.others = len(sweep.configs.keys() - set(sweep.rows["source"]))
-    fill(table, figures)
+    if options.test.metrics is None:
+        table.tested = [name for name in metrics if name not in TRAINING][:1]
+    else:
+        chosen = options.test.metrics
+        table.tested = [chosen] if isinstance(chosen, str) else list(chosen)
+    fill(table)
     table.caption = write_caption(table)
     table.notes = write_notes(table)
     return table
@@ -173,47 +166,39 @@ def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -
     return [Group(text.format(name, n), n, name) for name, n in itertools.product(titles, views)]
 
 
-def _reported(layout: Layout, groups: list[Group]) -> tuple[list[Line], list[dict]]:
-    """The paper's rows, and its figures with their line, group and metric."""
-    lines = []
-    cells = []
-    switches = {name: pair for pair, name in ABLATIONS.items()}
-    for method, figures in paper()["tables"][layout.reported]["rows"].items():
-        pair = switches.get(method)
-        by_group = {data_title(key) if isinstance(key, str) else key: row for key, row in figures.items()}
-        for number, group in enumerate(groups):
-            # The paper does not say with how many views its Table 1 was measured.
-            row = by_group.get(group.data or group.views, [])
-            for metric, figure in zip(paper()["metrics"], row, strict=False):
-                cells.append({"line": len(lines), "group": number, "metric": metric, "mean": figure})
-        variant = Variant("reported", method, ablation="" if pair is None else method, switches=pair)
-        lines.append(Line(variant, _signs(pair) if pair else (method,)))
-    return lines, cells
-
-
 def _signs(switches: tuple[bool, bool]) -> tuple[str, ...]:
     return tuple("✓" if on else "✗" for on in switches)
 
 
-def _ablation_lines(begun: list[Variant]) -> list[Line]:
-    """Rows of all four ablations, then of a user's own."""
-    papers = [replace(begun[0], ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
+def _reported_lines(layout: Layout) -> list[Line]:
+    switches = {name: pair for pair, name in ABLATIONS.items()}
     lines = []
-    for variant in (*papers, *(variant for variant in begun if variant.is_own)):
+    for method in paper()["tables"][layout.reported]["rows"]:
+        pair = switches.get(method)
+        variant = Variant("reported", method, ablation="" if pair is None else method, switches=pair)
+        lines.append(Line(variant, _signs(pair) if pair else (method,)))
+    return lines
+
+
+def _ablation_lines(variants: list[Variant]) -> list[Line]:
+    """Rows of all four ablations, then of a user's own."""
+    papers = [replace(variants[0], ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
+    lines = []
+    for variant in (*papers, *(variant for variant in variants if variant.is_own)):
         unprojection, semantic = _signs(variant.switches)
         note = " (a)" if variant.switches[1] and not variant.has_semantics else ""
         lines.append(Line(variant, (unprojection, semantic + note)))
     return lines
 
 
-def _method_lines(begun: list[Variant]) -> list[Line]:
-    """Rows of baselines, other methods and ours, which are called by what distinguishes them."""
-    models = [variant for variant in begun if variant.kind == "model"]
+def _method_lines(variants: list[Variant]) -> list[Line]:
+    """Rows of baselines, other methods and ours, which are named by what distinguishes them."""
+    models = [variant for variant in variants if variant.kind == "model"]
     parts = [[v.model, v.encoder, v.ablation, *v.titles] for v in models]
     differs = [len(set(values)) > 1 for values in zip(*parts, strict=True)]
-    names = {variant: BASELINES.get(variant.name, variant.name) for variant in begun}
+    names = {variant: BASELINES.get(variant.name, variant.name) for variant in variants}
     for variant, values in zip(models, parts, strict=True):
-        titles = [value for value, shown in zip(values, differs, strict=True) if shown and value not in PEERS]
+        titles = [value for value in itertools.compress(values, differs) if value not in PEERS]
         details = f" ({', '.join(titles)})" if titles else ""
         names[variant] = PEERS.get(variant.model, "Ours") + details
     return [Line(variant, (name,)) for variant, name in names.items()]
