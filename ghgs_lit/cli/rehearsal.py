@@ -127,7 +127,7 @@ class _Rehearsed:
         batch = self.attempt(data.training_batch, 0)  # now what is in the files
         self.attempt(check_evaluation, run, data)
         if chamfer and batch is not None and batch.body_vertices is None:
-            place = data.builder("train").inputs.reader.body_place(batch.subjects[0])
+            place = data.photographs("train").reader.body_place(batch.subjects[0])
             self.reasons[f"{place}: {expected}"] = None
         return True
 

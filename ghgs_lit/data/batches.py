@@ -7,20 +7,16 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from ghgs_lit.data.augmentation import Augmentation, Size
-from ghgs_lit.data.reader import PhotographCache
-from ghgs_lit.data.sampling import Sample, TrainingSampler, photo_name
-from ghgs_lit.data.view import View
+from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.sampling import Sample, TrainingSampler
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
-from ghgs_lit.types import Batch, Cameras, Targets
+from ghgs_lit.types import Batch
 
 #: Batches below which processes take longer to start than they save: forked ones,
 #: and those that import.
@@ -31,95 +27,24 @@ _MOST = 8
 
 
 @dataclass(frozen=True)
-class BatchBuilder:
-    """Reads samples into a :class:`Batch`.
-
-    Args:
-        inputs: photographs at the size of the inputs.
-        targets: photographs at the size of the targets.
-        depths: whether depth maps of the inputs are read, if there are any.
-        target_depths: whether those of the targets are, too; only measurements need them.
-    """
-
-    inputs: PhotographCache
-    targets: PhotographCache
-    depths: bool = True
-    target_depths: bool = True
-
-    def batch(
-        self, samples: Sequence[Sample], size: Size | None = None, target_size: Size | None = None
-    ) -> Batch:
-        """Batch of samples with equal numbers of inputs and equal target protocols (or none).
-
-        Args:
-            samples: the samples, at least one.
-            size: (height, width) of the inputs in pixels; None: that of their photographs.
-            target_size: (height, width) of the targets in pixels; None: that of their photographs.
-
-        Raises:
-            InputError: a file is missing or bad.
-        """
-        inputs = [self.inputs.views(s.subject, s.inputs, self.depths, size) for s in samples]
-        bodies = [self.inputs.body(s.subject) for s in samples]
-        known = all(body is not None for body in bodies)
-        return Batch(
-            images=_images(inputs),
-            masks=_stacked(inputs, "mask"),
-            cameras=_cameras(inputs),
-            targets=self._targets(samples, target_size) if samples[0].targets else None,
-            body_vertices=list(map(torch.from_numpy, bodies)) if known else None,
-            depths=_stacked(inputs, "depth"),
-            alpha=_stacked(inputs, "alpha"),
-            subjects=tuple(s.subject for s in samples),
-            views=tuple(tuple(map(photo_name, s.inputs)) for s in samples),
-        )
-
-    def _targets(self, samples: Sequence[Sample], size: Size | None) -> Targets:
-        views = [self.targets.views(s.subject, s.targets, self.target_depths, size) for s in samples]
-        return Targets(
-            images=_images(views),
-            masks=_stacked(views, "mask"),
-            cameras=_cameras(views),
-            names=tuple(tuple(map(photo_name, s.targets)) for s in samples),
-            protocols=samples[0].protocols,
-            depths=_stacked(views, "depth"),
-        )
-
-
-def _images(views: list[list[View]]) -> Tensor:
-    """Images [B, V, 3, h, w] float32 in [0, 1]."""
-    return _stacked(views, "image").permute(0, 1, 4, 2, 3).float().div_(255)
-
-
-def _stacked(views: list[list[View]], name: str) -> Tensor | None:
-    """One array of all views [B, V, ...]; None where a view lacks it."""
-    arrays = [getattr(view, name) for view in itertools.chain.from_iterable(views)]
-    if any(array is None for array in arrays):
-        return None
-    return torch.from_numpy(np.stack(arrays)).unflatten(0, (len(views), -1))
-
-
-def _cameras(views: list[list[View]]) -> Cameras:
-    return Cameras(*(_stacked(views, name) for name in ("intrinsics", "extrinsics")), *views[0][0].mask.shape)
-
-
-@dataclass(frozen=True)
 class TrainingBatches(Dataset):
     """Item ``step`` is the batch of process ``rank`` of ``world`` at that step of the run.
 
     Args:
-        builder: reads samples.
+        photographs: of the subjects.
         sampler: draws samples.
         augmentation: varies batches.
         length: steps of an epoch.
+        depths: whether depth maps of the inputs are read.
         rank: number of this process.
         world: number of processes.
     """
 
-    builder: BatchBuilder
+    photographs: Photographs
     sampler: TrainingSampler
     augmentation: Augmentation
     length: int
+    depths: bool
     rank: int = 0
     world: int = 1
 
@@ -128,13 +53,13 @@ class TrainingBatches(Dataset):
 
     def sizes(self, step: int) -> tuple[Size, Size]:
         """(height, width) of the inputs and of the targets at a step."""
-        inputs = self.builder.inputs.size
-        targets = self.builder.targets.size
+        fixed = self.photographs.size, self.photographs.target_size
         step_of_class = step // self.sampler.class_steps
-        return self.augmentation.draw_sizes(inputs, targets, self.sampler.seed, step_of_class)
+        return self.augmentation.draw_sizes(*fixed, self.sampler.seed, step_of_class)
 
     def __getitem__(self, step: int) -> Batch:
-        batch = self.builder.batch(self.sampler.batch(step, self.rank, self.world), *self.sizes(step))
+        samples = self.sampler.batch(step, self.rank, self.world)
+        batch = self.photographs.batch(samples, self.sizes(step), self.depths, target_depths=False)
         indices = self.sampler.indices(step, self.rank, self.world)
         return self.augmentation.imperfect(batch, self.sampler.seed, step, indices)
 
@@ -143,15 +68,15 @@ class EvaluationBatches(Dataset):
     """Fixed samples; an item has consecutive ones with equal target protocols.
 
     Args:
-        builder: reads samples.
+        photographs: of the subjects.
         samples: the samples.
         batch_size: largest number of samples in an item.
     """
 
-    def __init__(self, builder: BatchBuilder, samples: Sequence[Sample], batch_size: int) -> None:
-        self.builder = builder
+    def __init__(self, photographs: Photographs, samples: Sequence[Sample], batch_size: int) -> None:
+        self.photographs = photographs
         self.groups = []
-        for _, group in groupby(samples, lambda s: s.protocols):
+        for _, group in itertools.groupby(samples, lambda s: s.protocols):
             alike = list(group)
             self.groups += [alike[i : i + batch_size] for i in range(0, len(alike), batch_size)]
 
@@ -159,7 +84,7 @@ class EvaluationBatches(Dataset):
         return len(self.groups)
 
     def __getitem__(self, index: int) -> Batch:
-        return self.builder.batch(self.groups[index])
+        return self.photographs.batch(self.groups[index])
 
 
 class StepSampler(DistributedSampler):

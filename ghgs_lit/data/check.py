@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from ghgs_lit.data.batches import loader_of
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.mask_checks import SEARCH, height, implausible, overlap, silhouette, twins
-from ghgs_lit.data.reader import PHASES, PhotographCache, Reader
+from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
@@ -124,7 +124,7 @@ class Report:
 class _Readings(Dataset):
     """Item ``i`` is the result of reading photograph ``i``."""
 
-    photographs: PhotographCache
+    photographs: Photographs
     listed: Sequence[tuple[str, int, int]]
     min_iou: float
 
@@ -222,7 +222,7 @@ def _read(
             listed += [(name, position, view) for view in views]
     if not listed:
         return []
-    photographs = PhotographCache(reader, None, min(data.dataset.cache_images_mb, _CACHE_MB))
+    photographs = Photographs(reader, None, min(data.dataset.cache_images_mb, _CACHE_MB))
     items = _Readings(photographs, listed, min_iou)
     loader = loader_of(items, min(data.workers(len(items)), len(items)))
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))

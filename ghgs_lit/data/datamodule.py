@@ -1,6 +1,5 @@
 """LightningDataModule of all data sets."""
 
-import dataclasses
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -13,15 +12,14 @@ from torch.utils.data import DataLoader
 from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import (
-    BatchBuilder,
     EvaluationBatches,
     StepSampler,
     TrainingBatches,
     automatic_workers,
     loader_of,
 )
-from ghgs_lit.data.packed import Packing, folder_of, packed_reader
-from ghgs_lit.data.reader import PHASES, PhotographCache
+from ghgs_lit.data.packed import Packs, folder_of
+from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
     Sample,
@@ -112,7 +110,7 @@ class PhotographsDataModule(LightningDataModule):
         #: Whether training reads depth maps;
         #: evaluation reads them all the same, for its depth error.
         self.trains_on_depths = True
-        self._builders: dict[str, BatchBuilder] = {}
+        self._photographs: dict[str, Photographs] = {}
 
     @property
     def facts(self) -> dict[str, str]:
@@ -132,8 +130,8 @@ class PhotographsDataModule(LightningDataModule):
             choice("split", split, self.dataset.split_names)
         self.dataset.prepare(splits)
 
-    def builder(self, phase: str) -> BatchBuilder:
-        """Batch builder of a split, made at its first use.
+    def photographs(self, phase: str) -> Photographs:
+        """Photographs of a split, listed at their first use.
 
         Args:
             phase: name of the split.
@@ -142,18 +140,15 @@ class PhotographsDataModule(LightningDataModule):
             InputError: the data set has no such split.
         """
         choice("split", phase, self.dataset.split_names)
-        if phase not in self._builders:
+        if phase not in self._photographs:
             data = self.dataset
-            reader = self.dataset.reader(phase)
-            inputs = targets = PhotographCache(reader, data.size, data.cache_images_mb, data.resampling)
-            if data.target_size not in (None, data.size):
-                targets = PhotographCache(reader, data.target_size, data.cache_images_mb, data.resampling)
-            self._builders[phase] = BatchBuilder(inputs, targets)
-        return self._builders[phase]
+            options = data.size, data.cache_images_mb, data.resampling, data.target_size
+            self._photographs[phase] = Photographs(data.reader(phase), *options)
+        return self._photographs[phase]
 
     def subjects(self, phase: str) -> dict[str, tuple[int, ...]]:
         """Names and camera positions of the subjects of a phase."""
-        return self.builder(phase).inputs.reader.subjects
+        return self.photographs(phase).reader.subjects
 
     def training_sampler(self, targets: TargetProtocol | None = None) -> TrainingSampler:
         """Sampler of training.
@@ -168,85 +163,59 @@ class PhotographsDataModule(LightningDataModule):
 
     def training_batch(self, step: int) -> Batch:
         """The batch of a single process at ``step``."""
-        return self._training_batches(self.training_sampler(), step + 1)[step]
+        return self.training_batches(step + 1)[step]
 
-    def _training_batches(
-        self,
-        sampler: TrainingSampler,
-        length: int,
-        rank: int = 0,
-        world: int = 1,
-        builder: BatchBuilder | None = None,
-    ) -> TrainingBatches:
+    def training_batches(self, length: int, rank: int = 0, world: int = 1) -> TrainingBatches:
         """Batches of training for one process.
 
         Args:
-            sampler: draws samples.
             length: steps of an epoch.
             rank: number of this process.
             world: number of processes.
-            builder: reads samples; None: that of ``train``.
         """
-        builder = builder or self.builder("train")
-        builder = dataclasses.replace(builder, depths=self.trains_on_depths, target_depths=False)
-        return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
+        photographs = self.photographs("train")
+        parts = (photographs, self.training_sampler(), self.augmentation)
+        return TrainingBatches(*parts, length, self.trains_on_depths, rank, world)
 
-    def _packed_builder(self, batches: float, rank: int) -> BatchBuilder:
-        """Builder of training batches that reads packed files.
+    def _use_packs(self, batches: float, rank: int) -> None:
+        """Let photographs of training come from packed files, where these fit on the disk.
 
         Args:
-            batches: number of those of the whole run.
-            rank: number of this process.
-        """
-        plain = self.builder("train")
-        views = max(self.views.training_counts) + self.targets.per_step
-        reads = batches * self.dataset.batch_size * views
-        inputs = self._packed(plain.inputs, self.trains_on_depths, reads, rank)
-        if plain.targets is plain.inputs:
-            return BatchBuilder(inputs, inputs)
-        return BatchBuilder(inputs, self._packed(plain.targets, False, reads, rank))
-
-    def _packed(self, photographs: PhotographCache, depths: bool, reads: float, rank: int) -> PhotographCache:
-        """Photographs of training from packed files.
-
-        Args:
-            photographs: as they are read from their own files.
-            depths: whether depth maps are read, too.
-            reads: number of photographs that the run will read; files that are missing are written
-                only where this is more than there are photographs.
-            rank: number of this process; the first one says where packed files are.
-
-        Returns:
-            The same photographs, from packed files where there are any.
+            batches: number of those that are loaded in the whole run; files that are missing are
+                written only where these read more photographs than there are.
+            rank: number of this process; the first one logs where packed files are.
         """
         data = self.dataset
-        reader = photographs.reader
-        if data.packed_gb <= 0 or not reader.subjects:
-            return photographs
-        # Photographs that are resized in each step are packed as they are stored.
-        size = None if self.augmentation.varies_sizes else photographs.size
+        photographs = self.photographs("train")
+        subjects = self.subjects("train")
+        if data.packed_gb <= 0 or not subjects:
+            return
+        drawn = batches * data.batch_size * (max(self.views.training_counts) + self.targets.per_step)
         views = tuple(sorted({RING_VIEW, *self.targets.training_views}))
-        there = sum(map(len, reader.subjects.values())) * len(views)
-        packing = Packing(folder_of(data.folder), size, data.resampling, views, depths, writes=reads > there)
+        writes = drawn > sum(map(len, subjects.values())) * len(views)
+        # Photographs that are resized in each step are packed as they are stored.
+        varies = self.augmentation.varies_sizes
+        sizes = (None,) if varies else dict.fromkeys((photographs.size, photographs.target_size))
+        packs = {}
+        for size in sizes:
+            depths = self.trains_on_depths and size in (None, photographs.size)
+            options = (folder_of(data.folder), size, data.resampling, views, depths, writes)
+            packs[size] = Packs(photographs.reader, *options)
         announce = log.info if rank == 0 else log.debug
-        reader = packed_reader(reader, packing, data.packed_gb, announce)
-        if reader is photographs.reader:
-            return photographs
-        # the system keeps pages
-        return PhotographCache(reader, photographs.size, 0, data.resampling)
+        photographs.packs = {size: each for size, each in packs.items() if each.fit(data.packed_gb, announce)}
 
     def train_dataloader(self) -> DataLoader:
         """Batches of one epoch, which continues where the last one ended."""
-        sampler = self.training_sampler()
+        subjects = self.subjects("train")
         world = self.trainer.world_size if self.trainer else 1
         rank = self.trainer.global_rank if self.trainer else 0
-        once = math.ceil(len(sampler.subjects) / (self.dataset.batch_size * world))
+        once = math.ceil(len(subjects) / (self.dataset.batch_size * world))
         # Loading processes begin anew with each epoch,
         # for which a GPU would wait where subjects are few.
         length = self.dataset.steps_per_epoch or once * math.ceil(LEAST_STEPS / once)
         planned = planned_batches(self.trainer, length)
-        builder = self._packed_builder(planned, rank)
-        batches = self._training_batches(sampler, length, rank, world, builder)
+        self._use_packs(planned, rank)
+        batches = self.training_batches(length, rank, world)
         workers = self.workers(planned)
         if self.dataset.workers == "auto" and rank == 0:
             log.info("data.workers=auto: %d loading processes beside each that trains", workers)
@@ -274,7 +243,7 @@ class PhotographsDataModule(LightningDataModule):
         """
         protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
-        batches = EvaluationBatches(self.builder(split), specs, batch_size or self.dataset.batch_size)
+        batches = EvaluationBatches(self.photographs(split), specs, batch_size or self.dataset.batch_size)
         return loader_of(batches, self.workers(len(batches)))
 
     def evaluation_batch(
@@ -294,7 +263,7 @@ class PhotographsDataModule(LightningDataModule):
         """
         protocols = [] if targets is None else _protocols(targets)
         available = {subject: self.subjects(split)[subject]}
-        return self.builder(split).batch(self._evaluation_samples(available, protocols, views))
+        return self.photographs(split).batch(self._evaluation_samples(available, protocols, views))
 
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None

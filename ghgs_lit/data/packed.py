@@ -11,6 +11,7 @@ interrupted is written again, and where two processes write the same file, eithe
 
 import contextlib
 import functools
+import glob
 import hashlib
 import itertools
 import json
@@ -18,7 +19,7 @@ import logging
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -45,25 +46,29 @@ _MAPS = ("image", "mask", "matte", "inverse_depth")
 _CAMERA = ("intrinsics", "extrinsics")
 
 
-@dataclass(frozen=True)
-class Packing:
-    """How photographs are packed.
+@dataclass
+class Packs:
+    """Packed files of the subjects of a reader, at one size of photographs.
 
     Args:
-        folder: where the files are.
+        reader: of the photographs in their own files; a subject's file depends on its ``sources``.
+        folder: where packed files are.
         size: (height, width) of the packed photographs in pixels; None: as stored.
         resampling: how they are resized, as for :func:`ghgs_lit.data.view.resize_view`.
         views: numbers of the views at each position that are packed.
         depths: whether depth maps are packed.
         writes: whether missing files are written; otherwise only those that exist are read.
+        paths: file of each subject that was asked for; None: it cannot be packed.
     """
 
+    reader: Reader
     folder: Path
     size: tuple[int, int] | None
     resampling: str
     views: tuple[int, ...]
     depths: bool
     writes: bool = True
+    paths: dict[str, Path | None] = field(default_factory=dict)
 
     @property
     def digest(self) -> str:
@@ -71,62 +76,34 @@ class Packing:
         resized = None if self.size is None else (self.size, self.resampling)
         return _digest([_VERSION, PIL.__version__, resized, self.views, self.depths])
 
-
-class PackedReader(Reader):
-    """A reader whose photographs come from packed files, at their size, and from the other reader's
-    files where a subject cannot be packed.
-
-    Args:
-        reader: reads what is packed; its ``sources`` say what a subject's file depends on.
-        packing: where and how it is packed.
-    """
-
-    def __init__(self, reader: Reader, packing: Packing) -> None:
-        super().__init__(reader.strict)
-        self.reader = reader
-        self.packing = packing
-        self.subjects = reader.subjects
-        self._paths: dict[str, Path | None] = {}
-        self._writes = packing.writes
-
-    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """See :meth:`Reader.read_view`; photographs have the size of the packing.
+    def view(self, name: str, position: int, view: int, depth: bool) -> View | None:
+        """A photograph as :meth:`Reader.checked_view` returns it, at the size of the packed ones.
 
         Args:
             name: of the subject.
             position: number of the camera, or position on the ring.
             view: its number at the position.
-            depth: also read the depth map; from its own file where depth maps are not packed.
+            depth: with its depth map, if there is any.
+
+        Returns:
+            The photograph; None: it is not packed, or without its depth map.
         """
         pack = self.pack(name)
-        packed = None if pack is None or depth > self.packing.depths else pack.view(position, view, depth)
-        return self._unpacked(name, position, view, depth) if packed is None else packed
-
-    checked_view = read_view  # was checked before it was packed
-
-    def read_body(self, name: str) -> np.ndarray | None:
-        pack = self.pack(name)
-        return self.reader.read_body(name) if pack is None else pack.body
-
-    def _unpacked(self, name: str, position: int, view: int, depth: bool) -> View:
-        """A photograph as :meth:`read_view` gives it, read from its own files."""
-        stored = self.reader.checked_view(name, position, view, depth)
-        size = self.packing.size
-        return stored if size is None else resize_view(stored, *size, self.packing.resampling)
+        return None if pack is None or depth > self.depths else pack.view(position, view, depth)
 
     def pack(self, name: str) -> "Pack | None":
         """The packed file of a subject, written if it is missing; None: there is none."""
-        if name not in self._paths:
-            self._paths[name] = self._path(name)
-        path = self._paths[name]
+        if name not in self.paths:
+            self.paths[name] = self._path(name)
+        path = self.paths[name]
         if path is None:
             return None
         pack = _opened(path)
-        if pack is None and self._writes:
+        if pack is None and self.writes:
             self._write(name, path)
             pack = _opened(path)
         if pack is None:  # nothing is written or looked for again
-            self._paths[name] = None
+            self.paths[name] = None
         return pack
 
     def _path(self, name: str) -> Path | None:
@@ -139,54 +116,57 @@ class PackedReader(Reader):
             facts.append(source)
         if not facts:
             return None
-        return self.packing.folder / f"{name}-{self.packing.digest}-{_digest(facts)}.safetensors"
+        return self.folder / f"{name}-{self.digest}-{_digest(facts)}.safetensors"
 
     def _write(self, name: str, path: Path) -> None:
         """Write the file of a subject and remove older ones of the same settings."""
         content = {}
-        for position, view in itertools.product(self.subjects[name], self.packing.views):
+        for position, view in itertools.product(self.reader.subjects[name], self.views):
             with contextlib.suppress(InputError):  # raised when it is drawn
-                photograph = self._unpacked(name, position, view, self.packing.depths)
-                content |= _packed(position, view, photograph)
-        body = self.reader.read_body(name)
-        if body is not None:
-            content["body"] = body
+                stored = self.reader.checked_view(name, position, view, self.depths)
+                content |= _packed(position, view, resize_view(stored, self.size, self.resampling))
         try:
             write_atomically(path, lambda temporary: temporary.write_bytes(save(content)))
-            beginning = path.name.rpartition("-")[0] + "-"
-            for other in path.parent.iterdir():
-                if other.name.startswith(beginning) and other.suffix == path.suffix and other != path:
+            for other in self.folder.glob(f"{glob.escape(name)}-{self.digest}-*.safetensors"):
+                if other != path:
                     other.unlink(missing_ok=True)
         except OSError as error:
-            self._writes = False
+            self.writes = False
             log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
+
+    def fit(self, most_gb: float, announce: Callable[[str], None]) -> bool:
+        """Whether the files of all subjects may take the room that they need on the disk.
+
+        Args:
+            most_gb: largest size of all files in GB (10^9 bytes).
+            announce: takes a line on their size and place, or why nothing is packed.
+        """
+        names = list(self.reader.subjects)
+        pack = self.pack(names[0])
+        if pack is None:
+            return False
+        stored = sum(file.stat().st_size for file in self.folder.glob(f"*-{self.digest}-*.safetensors"))
+        whole = max(pack.bytes * len(names), stored)
+        free = shutil.disk_usage(self.folder).free
+        size = f"about {whole / 1e9:.2g} GB for {len(names)} subjects in {self.folder}"
+        if whole > most_gb * 1e9 or whole - stored > _SHARE_OF_DISK * free:
+            reason = f"{size} (data.packed_gb={most_gb:g}, {free / 1e9:.0f} GB are free)"
+            announce(f"photographs are not packed: {reason}")
+            return False
+        announce(f"photographs of training are packed: {size} (data.packed_gb=0: none)")
+        return True
 
 
 class Pack:
-    """The packed photographs of one subject, in the file ``path``.
-
-    Attributes:
-        body: vertices [n, 3] of the body, or None.
-        bytes: size of the file.
-    """
+    """The packed photographs of one subject, in the file ``path``, which has a size of ``bytes``."""
 
     def __init__(self, path: Path) -> None:
         self.bytes = path.stat().st_size
         self._file = safe_open(path, "np")
         self._names = frozenset(self._file.keys())
-        self.body = self._file.get_tensor("body") if "body" in self._names else None
 
     def view(self, position: int, view: int, depth: bool) -> View | None:
-        """One photograph.
-
-        Args:
-            position: number of the camera, or position on the ring.
-            view: its number at the position.
-            depth: with its depth map, if there is any.
-
-        Returns:
-            The photograph at its packed size; None: it is not in the file.
-        """
+        """One photograph as :meth:`Packs.view`; None: it is not in the file."""
         place = f"{position}/{view}/"
         if place + "box" not in self._names:
             return None
@@ -246,31 +226,3 @@ def folder_of(data: Path) -> Path:
         return in_data
     cache = Path(os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit").expanduser()
     return cache / "packed" / _digest([str(data.resolve())])
-
-
-def packed_reader(reader: Reader, packing: Packing, most_gb: float, say: Callable[[str], None]) -> Reader:
-    """A reader with packed photographs, if they fit.
-
-    Args:
-        reader: of the photographs in their own files.
-        packing: where and how they are packed.
-        most_gb: largest size of all files in GB (10^9 bytes); 0: nothing is packed.
-        say: is told size and place, or why nothing is packed.
-
-    Returns:
-        A :class:`PackedReader`, or ``reader`` itself where nothing is packed.
-    """
-    names = list(reader.subjects)
-    packed = PackedReader(reader, packing)
-    pack = packed.pack(names[0]) if names and most_gb > 0 else None
-    if pack is None:
-        return reader
-    there = sum(file.stat().st_size for file in packing.folder.glob(f"*-{packing.digest}-*.safetensors"))
-    whole = max(pack.bytes * len(names), there)
-    free = shutil.disk_usage(packing.folder).free
-    size = f"about {whole / 1e9:.2g} GB for {len(names)} subjects in {packing.folder}"
-    if whole > most_gb * 1e9 or whole - there > _SHARE_OF_DISK * free:
-        say(f"photographs are not packed: {size} (data.packed_gb={most_gb:g}, {free / 1e9:.0f} GB are free)")
-        return reader
-    say(f"photographs of training are packed: {size} (data.packed_gb=0: none)")
-    return packed

@@ -1,23 +1,30 @@
 """Readers of photographs by subject, position and view.
 
-A data set provides a :class:`Reader`, which finds and decodes its files. Resizing and caching
-(:class:`PhotographCache`), sampling and batching are the same for all data sets.
+A data set provides a :class:`Reader`, which finds and decodes its files. Resizing, caching and
+batching (:class:`Photographs`) and sampling are the same for all data sets.
 """
 
 import contextlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from ghgs_lit.data.decoding import check_array, check_view
+from ghgs_lit.data.sampling import Photo, Sample, photo_name
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.types import Batch, Cameras, Targets
+
+if TYPE_CHECKING:
+    from ghgs_lit.data.packed import Packs
 
 PHASES = ("train", "val")
+Size = tuple[int, int]
 
 
 class Reader(ABC):
@@ -139,34 +146,41 @@ class Reader(ABC):
             raise InputError(line)
 
 
-class PhotographCache:
-    """Photographs of a reader, resized and cached.
+class Photographs:
+    """Photographs of a reader: resized, kept in memory, and collated into batches.
 
     Args:
         reader: finds and decodes them.
-        size: (height, width) in pixels; None: as stored.
+        size: (height, width) of the inputs in pixels; None: as stored.
         cache_mb: MiB of decoded views and bodies kept in each process, at least 0; the least
             recently used go first.
         resampling: as for :func:`ghgs_lit.data.view.resize_view`.
+        target_size: (height, width) of the targets in pixels; None: as the inputs.
+
+    Attributes:
+        packs: packed files by the size of their photographs, which are read first.
     """
 
     def __init__(
         self,
         reader: Reader,
-        size: tuple[int, int] | None = None,
+        size: Size | None = None,
         cache_mb: float = 0,
         resampling: str = "area",
+        target_size: Size | None = None,
     ) -> None:
         require(cache_mb >= 0, "data.cache_images_mb", "at least 0", cache_mb)
         self.reader = reader
         self.size = size
+        self.target_size = target_size or size
         self.resampling = resampling
+        self.packs: Mapping[Size | None, Packs] = {}
         self.cached_bytes = 0
         self.cache_bytes = int(cache_mb * 2**20)
         self._cache: OrderedDict[tuple, View | np.ndarray | None] = OrderedDict()
 
     def view(
-        self, name: str, position: int, view: int = 0, depth: bool = True, size: tuple[int, int] | None = None
+        self, name: str, position: int, view: int = 0, depth: bool = True, size: Size | None = None
     ) -> View:
         """One photograph, resized with its intrinsics.
 
@@ -182,28 +196,19 @@ class PhotographCache:
                 or the mask is empty.
         """
         size = size or self.size
+        packs = self.packs.get(size) or self.packs.get(None)
+        packed = packs.view(name, position, view, depth) if packs else None
+        if packed is not None:
+            return resize_view(packed, size, self.resampling)
 
         def read() -> View:
             stored = self.reader.checked_view(name, position, view, depth)
-            return stored if size is None else resize_view(stored, *size, self.resampling)
+            return resize_view(stored, size, self.resampling)
 
         return self._cached((name, position, view, depth, size), read)
 
-    def views(
-        self,
-        name: str,
-        photos: Iterable[tuple[int, int]],
-        depth: bool = True,
-        size: tuple[int, int] | None = None,
-    ) -> list[View]:
-        """Several photographs of a subject, each by its position and view, as :meth:`view`."""
-        return [self.view(name, *photo, depth, size) for photo in photos]
-
     def body(self, name: str) -> np.ndarray | None:
         """Body vertices as :meth:`Reader.read_body`.
-
-        Args:
-            name: of the subject.
 
         Raises:
             InputError: they are bad.
@@ -229,3 +234,65 @@ class PhotographCache:
             while self.cached_bytes > self.cache_bytes:
                 self.cached_bytes -= getattr(self._cache.popitem(last=False)[1], "nbytes", 0)
         return value
+
+    def batch(
+        self,
+        samples: Sequence[Sample],
+        sizes: tuple[Size, Size] | None = None,
+        depths: bool = True,
+        target_depths: bool = True,
+    ) -> Batch:
+        """Batch of samples with equal numbers of inputs and equal target protocols (or none).
+
+        Args:
+            samples: the samples, at least one.
+            sizes: (height, width) of the inputs and of the targets in pixels; None: those of the
+                photographs.
+            depths: whether depth maps of the inputs are read, if there are any.
+            target_depths: whether those of the targets are, too; only measurements need them.
+
+        Raises:
+            InputError: a file is missing or bad.
+        """
+        size, target_size = sizes or (self.size, self.target_size)
+        photos = [(sample.subject, sample.inputs) for sample in samples]
+        maps, names = self._collate(photos, depths, size)
+        bodies = [self.body(sample.subject) for sample in samples]
+        has_bodies = all(body is not None for body in bodies)
+        targets = None
+        if samples[0].targets:
+            photos = [(sample.subject, sample.targets) for sample in samples]
+            target_maps, target_names = self._collate(photos, target_depths, target_size)
+            del target_maps["alpha"]
+            targets = Targets(**target_maps, names=target_names, protocols=samples[0].protocols)
+        return Batch(
+            **maps,
+            targets=targets,
+            body_vertices=list(map(torch.from_numpy, bodies)) if has_bodies else None,
+            subjects=tuple(sample.subject for sample in samples),
+            views=names,
+        )
+
+    def _collate(
+        self, photos: Sequence[tuple[str, Sequence[Photo]]], depth: bool, size: Size | None
+    ) -> tuple[dict[str, Any], tuple[tuple[str, ...], ...]]:
+        """Maps [B, V, ...] and cameras of the photographs of B subjects, and the photographs' names;
+        None for a map that a photograph lacks."""
+        views = []
+        for name, several in photos:
+            views += [self.view(name, *photo, depth, size) for photo in several]
+
+        def stack(name: str) -> torch.Tensor | None:
+            arrays = [getattr(view, name) for view in views]
+            if any(array is None for array in arrays):
+                return None
+            return torch.from_numpy(np.stack(arrays)).unflatten(0, (len(photos), -1))
+
+        maps = {
+            "images": stack("image").permute(0, 1, 4, 2, 3).float().div_(255),
+            "masks": stack("mask"),
+            "cameras": Cameras(stack("intrinsics"), stack("extrinsics"), *views[0].mask.shape),
+            "depths": stack("depth"),
+            "alpha": stack("alpha"),
+        }
+        return maps, tuple(tuple(map(photo_name, several)) for _, several in photos)

@@ -237,7 +237,7 @@ def half_centers(intrinsics: np.ndarray) -> np.ndarray:
     return intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
-def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
+def resize_view(view: View, size: tuple[int, int] | None, resampling: str = "area") -> View:
     """Resize a photograph with its mask and depth map, and scale its intrinsics.
 
     Mattes are resized like photographs, and the mask is then where they are at least half. Depth is
@@ -245,14 +245,14 @@ def resize_view(view: View, height: int, width: int, resampling: str = "area") -
 
     Args:
         view: the photograph.
-        height: new height in pixels.
-        width: new width in pixels.
+        size: new (height, width) in pixels; None: as it is.
         resampling: ``area`` keeps everything in place; ``release``, as the authors' code, resizes
             photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour.
     """
-    h, w = view.mask.shape
-    if (h, w) == (height, width):
+    if size in (None, view.mask.shape):
         return view
+    h, w = view.mask.shape
+    height, width = size
     intrinsics = view.intrinsics.astype(np.float64)
     intrinsics[:2] *= np.array([[width / w], [height / h]])
     resize = {"area": (area_image, area_mask), "release": (release_image, release_mask)}

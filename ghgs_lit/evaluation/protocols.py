@@ -71,7 +71,7 @@ def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol
     Raises:
         InputError: Names the first view that is not there.
     """
-    reader = data.builder(split).targets.reader
+    reader = data.photographs(split).reader
     for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.groups:
         for sample in batch:
             for position, view in sample.targets:

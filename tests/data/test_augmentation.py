@@ -1,8 +1,6 @@
 """Variation of training batches: what each switch changes,
 and that batches depend on seed and step alone."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -35,9 +33,8 @@ def test_nothing_varies_by_default(boxes):
     assert Augmentation.read(none, "augmentation") == Augmentation()
     data = module(boxes, augmentation=none)
     # for measurements alone
-    builder = dataclasses.replace(data.builder("train"), target_depths=False)
     for step in range(3):
-        batch = builder.batch(data.training_sampler().batch(step))
+        batch = data.photographs("train").batch(data.training_sampler().batch(step), target_depths=False)
         assert equal(data.training_batch(step), batch)
         assert equal(module(boxes).training_batch(step), batch)
 
@@ -82,7 +79,7 @@ def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
 def test_sizes_of_a_class_are_drawn_once(boxes):
     varied = {"sizes": [28, 42], "target_scale": [0.7, 1.0]}
     sizes = [
-        [data._training_batches(data.training_sampler(), 6).sizes(step) for step in range(6)]
+        [data.training_batches(6).sizes(step) for step in range(6)]
         for data in (module(boxes, augmentation=varied, class_steps=steps) for steps in (1, 3))
     ]
     assert sizes[1] == [sizes[0][0]] * 3 + [sizes[0][1]] * 3
@@ -103,10 +100,10 @@ def test_sizes_are_drawn_for_a_step_and_cameras_follow(boxes):
         assert abs(ratios[0] - ratios[1]) < 1 / 28
         scales.append(ratios[0])
         assert (batch.cameras.height, batch.cameras.width) == size
-        whole = data.builder("train").batch(data.training_sampler().batch(step))
+        whole = data.photographs("train").batch(data.training_sampler().batch(step))
         expected = whole.cameras.resized(*size).intrinsics
         torch.testing.assert_close(batch.cameras.intrinsics, expected)
-        processes = [data._training_batches(data.training_sampler(), 1, rank, 2)[step] for rank in (0, 1)]
+        processes = [data.training_batches(1, rank, 2)[step] for rank in (0, 1)]
         assert len({one.images.shape[-3:] for one in processes}) == 1
         assert len({one.targets.images.shape for one in processes}) == 1
     assert inputs == {(28, 28), (42, 28)}

@@ -8,7 +8,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics, read_map, read_photograph
-from ghgs_lit.data.reader import PhotographCache, Reader
+from ghgs_lit.data.reader import Photographs, Reader
 from ghgs_lit.data.view import View
 from tests.helpers.captures import refused
 
@@ -120,15 +120,15 @@ def test_wrong_cameras_are_refused(check, matrix, line):
 def test_what_a_reader_gives_is_checked(changes, line):
     """A reader of one's own that returns other types, sizes or cameras is stopped on the host."""
     view = dataclasses.replace(SOUND, **changes)
-    assert PhotographCache(OneView(SOUND)).view("a", 0) is SOUND
-    refused(rf"^a/0\.png: {line}", lambda: PhotographCache(OneView(view)).view("a", 0))
+    assert Photographs(OneView(SOUND)).view("a", 0) is SOUND
+    refused(rf"^a/0\.png: {line}", lambda: Photographs(OneView(view)).view("a", 0))
 
 
 def test_bodies_with_nan_are_refused():
     """One NaN vertex would make the whole Chamfer loss NaN."""
     body = np.zeros((5, 3), np.float32)
     body[2, 1] = np.nan
-    refused("a: body: expected finite numbers", lambda: PhotographCache(OneView(SOUND, body)).body("a"))
+    refused("a: body: expected finite numbers", lambda: Photographs(OneView(SOUND, body)).body("a"))
 
 
 @pytest.mark.parametrize("number", [10**400, float("inf"), float("nan"), "inf", None, True + 0j])

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.data.reader import PhotographCache
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError
 from scripts.miniatures import humman, zju_mocap
@@ -47,7 +47,7 @@ def data(kind: str, root: Path, *overrides: str, sequence: str = "386"):
     return build_data(kind, root, *split, *overrides, "data.workers=0")
 
 
-def photographs(kind: str, root: Path, size=None, *overrides: str) -> PhotographCache:
+def photographs(kind: str, root: Path, size=None, *overrides: str) -> Photographs:
     return stored(data(kind, root, *overrides), "val", size)
 
 

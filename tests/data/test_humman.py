@@ -13,7 +13,7 @@ from PIL import Image
 from scipy import sparse
 
 from ghgs_lit.data.humman import HuMMan
-from ghgs_lit.data.reader import PhotographCache
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.smpl import read_model, read_parameters
 from scripts.miniatures.smpl import stand_in
 from tests.helpers.captures import (
@@ -26,9 +26,9 @@ TEST = "p000455_a000986"
 WIDTH, HEIGHT = 160, 90
 
 
-def photographs(root: Path, size=None, **options) -> PhotographCache:
+def photographs(root: Path, size=None, **options) -> Photographs:
     data = HuMMan(root=root, split={"val": [TEST]}, frames=(0, 97, 6), **options)
-    return PhotographCache(data.reader("val"), size)
+    return Photographs(data.reader("val"), size)
 
 
 def test_frames_are_multiples_of_6_and_some_lack(humman_root):

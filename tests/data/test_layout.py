@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from ghgs_lit.data.layout import Layout
-from ghgs_lit.data.reader import PhotographCache
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError
@@ -44,8 +44,8 @@ def write_person(root, name="box", size=SIZE, positions=(0, 4)) -> dict:
     return written
 
 
-def photographs(root, size=None, cache_mb=0, **options) -> PhotographCache:
-    return PhotographCache(Layout(root, "train", **options), size, cache_mb)
+def photographs(root, size=None, cache_mb=0, **options) -> Photographs:
+    return Photographs(Layout(root, "train", **options), size, cache_mb)
 
 
 @pytest.fixture(scope="module")

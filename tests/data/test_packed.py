@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from ghgs_lit.data import packed
+from ghgs_lit.data.reader import Photographs
 from tests.helpers.people import equal, render_boxes, rendered
 
 SIZES = {"sizes": [28, [42, 28]], "target_scale": [0.7, 1.0]}
@@ -137,11 +138,12 @@ def test_a_broken_photograph_is_named_when_it_is_drawn(root):
     path = root / "train" / "img" / "s0_000" / "0.jpg"
     path.write_bytes(b"no image")
     reader = rendered(root).dataset.reader("train")
-    packing = packed.Packing(root / "packed", None, "area", (0, 2), True)
-    found = packed.packed_reader(reader, packing, 1, print)
-    assert found.checked_view("s0", 0, 2, True).image.shape == (42, 42, 3)
+    photographs = Photographs(reader)
+    photographs.packs = {None: packed.Packs(reader, root / "packed", None, "area", (0, 2), True)}
+    assert photographs.view("s0", 0, 2).image.shape == (42, 42, 3)
+    assert files(root)
     with pytest.raises(ValueError, match=r"s0_000.0\.jpg: expected a readable image"):
-        found.checked_view("s0", 0, 0, True)
+        photographs.view("s0", 0, 0)
 
 
 def test_packing_can_be_switched_off(root):

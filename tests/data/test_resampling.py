@@ -55,7 +55,7 @@ def test_release_resizes_as_opencv_and_pillow(size):
     np.testing.assert_array_equal(release_image(RECORDED["photograph"], *image.shape[:2]), image)
     np.testing.assert_array_equal(release_mask(RECORDED["mask"][..., 0], *mask.shape), mask)
     view = View(RECORDED["photograph"], RECORDED["mask"][..., 0] > 0, None, np.eye(3), np.eye(4))
-    resized = resize_view(view, *mask.shape, "release")
+    resized = resize_view(view, mask.shape, "release")
     np.testing.assert_array_equal(resized.image, image)
     np.testing.assert_array_equal(resized.mask, mask > 0)
 
@@ -107,7 +107,7 @@ def test_a_resized_view_has_depth_in_its_mask_only():
     inverse = encode_depth(np.where(mask, 2.0, 0))
     view = View(np.zeros((96, 96, 3), np.uint8), mask, inverse, np.eye(3), np.eye(4))
     for resampling in ("area", "release"):
-        halved = resize_view(view, 48, 48, resampling)
+        halved = resize_view(view, (48, 48), resampling)
         np.testing.assert_array_equal(halved.inverse_depth > 0, halved.mask)
 
 
@@ -124,8 +124,7 @@ def test_the_release_protocol_loads_as_the_release(tmp_path):
         cfg = compose("train", [override, f"data.root={tmp_path / 'root'}", "data.size=21"])
         data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
         assert data.facts == {"name": "thuman2", "pixel_centers": centers, "resampling": resampling}
-        builder = data.builder("val")
-        assert builder.inputs.resampling == builder.targets.resampling == resampling
+        assert data.photographs("val").resampling == resampling
         assert data.dataset.reader("val")._shift == 0
     with pytest.raises(InputError, match=r"data\.resampling: expected one of area, release; found 'cubic'"):
         build({**cfg.data, "resampling": "cubic"}, "data", views=cfg.views, targets=cfg.targets, seed=0)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.data.reader import PhotographCache
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.data.zju_mocap import ZJUMoCap, frame_number, read_annotations
 from ghgs_lit.errors import InputError
@@ -23,9 +23,9 @@ SIZE = 112
 BOTH = ("mask_cihp", "mask")
 
 
-def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> PhotographCache:
+def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> Photographs:
     split = {key: [{"sequences": [sequence], "frames": list(frames)}] for key in ("train", "val")}
-    return PhotographCache(ZJUMoCap(root=root, split=split, **options).reader("val"), size)
+    return Photographs(ZJUMoCap(root=root, split=split, **options).reader("val"), size)
 
 
 def test_bodies_project_into_every_mask(zju_root):

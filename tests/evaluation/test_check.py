@@ -6,7 +6,7 @@ import pytest
 
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
-from ghgs_lit.data.reader import PhotographCache
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
 
@@ -40,7 +40,7 @@ def check(root, *overrides):
 def test_an_impossible_evaluation_is_refused_before_a_photograph_is_read(boxes, monkeypatch, said, refused):
     """A run of days must not end without results because of a value that was wrong
     from the start."""
-    monkeypatch.setattr(PhotographCache, "view", lambda *_: pytest.fail("a photograph was read"))
+    monkeypatch.setattr(Photographs, "view", lambda *_: pytest.fail("a photograph was read"))
     check(boxes)
     with pytest.raises(InputError, match=refused):
         check(boxes, said)

@@ -14,7 +14,7 @@ import yaml
 from PIL import Image
 
 from ghgs_lit.config import conf_dir, run_of
-from ghgs_lit.data.reader import PhotographCache
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES
 from ghgs_lit.evaluation.measure import ModelMethod, measure_all
@@ -224,13 +224,13 @@ def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeyp
     """A data set of thousands must not be read up to the subject;
     targets are read where they are asked."""
     read = []
-    view = PhotographCache.view
+    view = Photographs.view
 
     def recorded(self, name, position, number=0, depth=True, size=None):
         read.append((name, position, number))
         return view(self, name, position, number, depth, size)
 
-    monkeypatch.setattr(PhotographCache, "view", recorded)
+    monkeypatch.setattr(Photographs, "view", recorded)
     path = trained / "checkpoints" / "last.ckpt"
     arguments = [f"checkpoint={path}", "subject=s4", "turntable.frames=0", f"hydra.run.dir={tmp_path / 'r'}"]
     assert ghgs("predict", *arguments) == 0

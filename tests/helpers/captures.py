@@ -14,8 +14,8 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.packed import Packing, packed_reader
-from ghgs_lit.data.reader import PhotographCache, Reader
+from ghgs_lit.data.packed import Packs
+from ghgs_lit.data.reader import Photographs, Reader
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError
 from ghgs_people import figures
@@ -43,21 +43,20 @@ def build_data(name: str, root: Path, *overrides: str):
     return build(node, "data", views=cfg.views, targets=cfg.targets, seed=0)
 
 
-def stored(data, phase: str, size: tuple[int, int] | None = None) -> PhotographCache:
+def stored(data, phase: str, size: tuple[int, int] | None = None) -> Photographs:
     """The photographs of a data module, at their stored size unless ``size`` is given."""
-    return PhotographCache(data.dataset.reader(phase), size)
+    return Photographs(data.dataset.reader(phase), size)
 
 
 def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> None:
-    """Check that photographs and bodies from packed files in ``folder`` are those of a reader,
+    """Check that photographs from packed files in ``folder`` are those of a reader,
     to the bit."""
-    packed = packed_reader(reader, Packing(folder, size, "area", (0,), False), 1, print)
+    packed = Packs(reader, folder, size, "area", (0,), False)
     for name, positions in reader.subjects.items():
         assert packed.pack(name) is not None
-        np.testing.assert_array_equal(packed.read_body(name), reader.read_body(name))
         for position in positions:
-            found = packed.checked_view(name, position, 0, False)
-            expected = resize_view(reader.checked_view(name, position, 0, False), *size)
+            found = packed.view(name, position, 0, False)
+            expected = resize_view(reader.checked_view(name, position, 0, False), size)
             for field in dataclasses.fields(View):
                 np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
 
