@@ -1,14 +1,10 @@
-"""Output of tables as Markdown and on the terminal, and of figures as PNG."""
+"""Output of tables as Markdown and on the terminal."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from matplotlib.figure import Figure
 from tabulate import tabulate
-
-from ghgs_lit.files import write_atomically
 
 Tables = dict[str, pd.DataFrame]  #: Tables of texts by their titles
 
@@ -52,11 +48,6 @@ def pivoted(frame: pd.DataFrame, index: str, columns: str, values: str, form: st
     return table.map(text, form=form).reset_index()
 
 
-def to_markdown(table: pd.DataFrame) -> str:
-    """A table as Markdown."""
-    return table.to_markdown(index=False, disable_numparse=True)
-
-
 def document(title: str, notes: Sequence[str], tables: Tables) -> str:
     """Markdown page of notes, then each table below its title.
 
@@ -67,7 +58,7 @@ def document(title: str, notes: Sequence[str], tables: Tables) -> str:
     """
     parts = [f"# {title}", *notes]
     for name, table in tables.items():
-        parts += [f"## {name}", to_markdown(table)]
+        parts += [f"## {name}", table.to_markdown(index=False, disable_numparse=True)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -75,8 +66,3 @@ def print_tables(tables: Tables) -> None:
     """Print tables at full width."""
     for name, table in tables.items():
         print(name, tabulate(table, "keys", showindex=False, disable_numparse=True), sep="\n\n", end="\n\n")
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    write_atomically(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))

@@ -7,13 +7,12 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import pandas as pd
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from ghgs_lit.diagnostics.benchmark.presets import Case
+from ghgs_lit.diagnostics.benchmark.cases import Case
 from ghgs_lit.evaluation.measure import Estimate, Renderer, measure
 from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS, STAGES
@@ -130,11 +129,9 @@ def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], 
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
         return torch.arange(n), torch.arange(n)
-    frames = [pd.DataFrame({"image": g.image.cpu(), "pixel": g.pixel.cpu()}) for g in (found, expected)]
-    frames = [frame.rename_axis(name).reset_index() for frame, name in zip(frames, ("a", "b"), strict=True)]
-    both = frames[0].merge(frames[1], on=["image", "pixel"])
-    device = found.means.device
-    return tuple(torch.tensor(both[name].to_numpy().copy(), device=device) for name in ("a", "b"))
+    keys = [(g.image.cpu().long() << 40 | g.pixel.cpu()).numpy() for g in (found, expected)]
+    _, *pairs = np.intersect1d(*keys, return_indices=True)
+    return tuple(torch.from_numpy(index).to(found.means.device) for index in pairs)
 
 
 Result = tuple[Prediction, Rendering]
@@ -218,13 +215,6 @@ def conditioned(found: Result, expected: Result, batch: Batch, condition: Mappin
 
 
 WARMUP = 1  #: Rounds that do not count; the first compiles and fills caches
-#: FLOPs of attention on a CPU, which PyTorch's counter lacks.
-_CPU_ATTENTION = {
-    attend.packet: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v),
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: (
-        lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)
-    ),
-}
 
 
 @dataclass
@@ -248,8 +238,13 @@ class Record:
 
 def flop_counter() -> FlopCounterMode:
     """Context that counts products, convolutions and attention; not element-wise operations and the
-    rasterizer."""
-    return FlopCounterMode(display=False, custom_mapping=_CPU_ATTENTION)
+    rasterizer. PyTorch's counter lacks attention on a CPU."""
+
+    def attention(q: tuple, k: tuple, v: tuple, *_: object, **__: object) -> int:
+        return sdpa_flop_count(q, k, v)
+
+    kernels = (attend.packet, torch.ops.aten._scaled_dot_product_flash_attention_for_cpu)
+    return FlopCounterMode(display=False, custom_mapping=dict.fromkeys(kernels, attention))
 
 
 def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[dict[str, float], Result]:

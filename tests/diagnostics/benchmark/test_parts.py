@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.diagnostics.benchmark import measure
+from ghgs_lit.diagnostics.benchmark.cases import Case, combinations
 from ghgs_lit.diagnostics.benchmark.measure import (
     ATTRIBUTES,
     MOST,
@@ -28,7 +29,6 @@ from ghgs_lit.diagnostics.benchmark.measure import (
     top_level,
     watched,
 )
-from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
