@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ import torch
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.diagnostics.output import Tables, document, pivoted, print_tables
+from ghgs_lit.diagnostics.output import document, pivoted, print_tables
 from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
@@ -45,34 +46,30 @@ def run(verb: "Stress") -> None:
     tasks = tasks_of(verb.stages, verb.families, verb.quick)
     require(bool(tasks), "families", "a family that one of the stages has", verb.families)
     rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)
-    cases = sum(row["cases"] for row in rows)
-    failed = [row for row in rows if row["failures"]]
-    failures = sum(row["failures"] for row in failed)
-    summary = f"{cases} cases, {failures} failures"
-    tables = tables_of(rows)
+    cells = pd.DataFrame(rows)
+    tables = {"Worst error, in units of eps times the condition number": worst_errors(cells)}
+    summary = f"{cells.cases.sum()} cases, {cells.failures.sum()} failures"
     print_tables(tables)
     print(summary)
-    tables["Budgets"] = pd.DataFrame(
-        [(s, STAGES[s].reason) for s in _unique(rows, "stage")], columns=["stage", "reason"]
-    )
-    tables["Families"] = pd.DataFrame(
-        [(f, FAMILIES[f].text) for f in _unique(rows, "family")], columns=["family", "inputs"]
-    )
+    reasons = [(name, STAGES[name].reason) for name in cells.stage.unique()]
+    inputs = [(name, FAMILIES[name].text) for name in cells.family.unique()]
+    tables["Budgets"] = pd.DataFrame(reasons, columns=["stage", "reason"])
+    tables["Families"] = pd.DataFrame(inputs, columns=["family", "inputs"])
     write_text_atomically(directory / "stress.md", document("Stress test", [f"{summary}."], tables))
-    source = provenance(verb.plain, seed=0, verb="stress", choices=choices())
-    content = {"cases": cases, "failures": failures, "cells": rows, "provenance": source}
+    content = {"cases": int(cells.cases.sum()), "failures": int(cells.failures.sum()), "cells": rows}
+    content["provenance"] = provenance(verb.plain, seed=0, verb="stress", choices=choices())
     path = directory / "stress.json"
     write_text_atomically(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
     announce(path)
-    for row in failed:
-        cell = f"{row['stage']}, {row['family']}, {row['dtype']}"
+    for row in filter(itemgetter("failures"), rows):
         error = "no bound" if row["error"] is None else f"{row['error']:.3g}"
         print(
-            f"ghgs stress: {cell}: expected an error of at most {row['budget']:g}; found"
-            f" {error} in {row['failures']} of {row['cases']} cases ({row['worst']})",
+            f"ghgs stress: {row['stage']}, {row['family']}, {row['dtype']}: expected an error of at most"
+            f" {row['budget']:g}; found {error} in {row['failures']} of {row['cases']} cases"
+            f" ({row['worst']})",
             file=sys.stderr,
         )
-    if failed:
+    if content["failures"]:
         raise SystemExit(1)
 
 
@@ -94,16 +91,15 @@ def tasks_of(
             choice(key, name, tuple(known))
     tasks = []
     for name in STAGES if stages is None else stages:
-        stage = STAGES[name]
-        seeds = stage.seeds
+        seeds = STAGES[name].seeds
         if quick:
             seeds = 1 if seeds < 25 else 3
-        chosen = [family for family in stage.families if families is None or family in families]
+        chosen = [family for family in STAGES[name].families if families is None or family in families]
         tasks += [(name, family, seeds) for family in chosen]
     return tasks
 
 
-def cells(task: Task) -> list[Row]:
+def measure_task(task: Task) -> list[Row]:
     """The cells of a task, one for each dtype."""
     name, family, seeds = task
     return measure(STAGES[name], family, seeds)
@@ -118,28 +114,22 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
     """
     shown = track(tasks, "stages and families")
     if workers == 0:
-        return list(itertools.chain.from_iterable(map(cells, shown)))
+        return list(itertools.chain.from_iterable(map(measure_task, shown)))
     # Spawned: a forked child would inherit locks of threads that it does not have.
     context = get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, initializer=torch.set_num_threads, initargs=(1,))
     try:
-        return list(
-            itertools.chain.from_iterable(rows for _, rows in zip(shown, pool.map(cells, tasks), strict=True))
-        )
+        results = zip(shown, pool.map(measure_task, tasks), strict=True)
+        return list(itertools.chain.from_iterable(rows for _, rows in results))
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def tables_of(rows: Sequence[Row]) -> Tables:
+def worst_errors(cells: pd.DataFrame) -> pd.DataFrame:
     """Worst error of each stage and dtype, next to its cases and its budget."""
-    frame = pd.DataFrame(rows)
-    frame["error"] = frame.error.astype(float).fillna(np.inf)
-    worst = frame.groupby(["stage", "dtype"], sort=False).error.max().reset_index()
+    cells = cells.assign(error=cells.error.astype(float).fillna(np.inf))
+    worst = cells.groupby(["stage", "dtype"], sort=False).error.max().reset_index()
     table = pivoted(worst, "stage", "dtype", "error", "{:.3g}").replace("inf", "no bound")
-    table.insert(1, "cases", list(frame.groupby("stage", sort=False).cases.sum()))
+    table.insert(1, "cases", list(cells.groupby("stage", sort=False).cases.sum()))
     table.insert(2, "budget", [f"{STAGES[name].factor:g}" for name in table.stage])
-    return {"Worst error, in units of eps times the condition number": table}
-
-
-def _unique(rows: Sequence[Row], key: str) -> list[str]:
-    return list(dict.fromkeys(row[key] for row in rows))
+    return table
