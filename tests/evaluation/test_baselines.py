@@ -12,7 +12,6 @@ from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline, nearest_view, splats_at
 from ghgs_lit.geometry.projection import project
-from ghgs_lit.metrics import psnr
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Rendering, Targets
 from tests.helpers.scenes import CENTER, RADII, painted_ellipsoid
@@ -71,26 +70,6 @@ def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
     # 0.5 pixels at depth 1.7 under a focal length of 16 pixels
     assert torch.allclose(first.scales, torch.full_like(first.scales, 0.5 * 1.7 / 16))
     assert torch.equal(first.colors[:seen], batch.images[0, 0].movedim(0, -1)[batch.masks[0, 0]])
-
-
-def test_true_depth_renders_the_input_again():
-    """With the true depth the input view is reproduced: cameras, depths and renderer agree."""
-    batch = example_batch(subjects=1, views=2, size=32)
-    smooth = torch.linspace(0.2, 0.8, 32).expand_as(batch.images)
-    batch = dataclasses.replace(batch, images=smooth)
-    own = dataclasses.replace(
-        batch.targets, images=batch.images[:, :1], masks=batch.masks[:, :1], cameras=batch.cameras[:, :1]
-    )
-    # Only the first view, so that no other view's splats stand in front.
-    alone = batch.masks.clone()
-    alone[:, 1] = False
-    batch = dataclasses.replace(batch, targets=own, masks=alone)
-    method = named("true_depth", Renderer(backend="reference"))
-    estimate = method(batch)
-    assert torch.equal(estimate.depth, batch.depths)
-    inside = batch.masks[0, 0]
-    assert psnr(estimate.image[0], batch.images[0, :1], inside[None]).item() > 15
-    assert estimate.image[0, 0, :, ~inside].mean() < 0.1
 
 
 def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():

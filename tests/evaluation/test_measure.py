@@ -10,15 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
 
-from ghgs_lit.config import conf_dir, run_of
 from ghgs_lit.data.reader import Photographs
-from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES
 from ghgs_lit.evaluation.measure import ModelMethod, measure_all
-from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer
@@ -119,22 +115,6 @@ def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_p
         ghgs("evaluate", f"checkpoint={path}", "encoder=vggt_small", f"hydra.run.dir={tmp_path / 'r'}") == 1
     )
     assert not (tmp_path / "r" / "metrics.json").exists()
-
-
-def test_each_target_protocol_has_the_values_of_its_own_file():
-    """Only the selected protocol has overrides; the others are read from conf/targets."""
-    run = run_of("evaluate", ["targets.per_subject=all", "evaluation.targets=[midway,release,ghg]"])
-    found = target_protocols(run)
-    assert list(found) == ["midway", "release", "ghg"]
-    assert found["release"] == {**run.plain["targets"], "kind": "release"}
-    for name in ("midway", "ghg"):
-        own = yaml.safe_load((conf_dir() / "targets" / f"{name}.yaml").read_text())
-        said = {key: value for key, value in own.items() if key != "defaults"}
-        assert found[name].items() >= said.items()
-        assert found[name]["training_views"] == {"midway": [0, 2, 3, 4], "ghg": [2, 3, 4]}[name]
-    said = r"evaluation\.targets: expected one of cameras, ghg, .*; found 'midwy' \(did you mean midway\?\)"
-    with pytest.raises(InputError, match=said):
-        target_protocols(run_of("evaluate", ["evaluation.targets=[release,midwy]"]))
 
 
 def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_path):

@@ -42,28 +42,6 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["model_v3_midway_p0.png"]
 
 
-def test_refined_gaussians_have_no_depth_error():
-    """They left the predicted depths: the error of these is not theirs."""
-    batch, drawn = example_batch(), []
-
-    def refinement(gaussians, batch):
-        drawn.append(gaussians)
-        return gaussians
-
-    rows = measure(ModelMethod(Standin(), flat_renderer, refinement), "model", [batch], OFF)
-    assert len(drawn) == 1
-    assert rows[0]["depth_error_mm"] is None
-
-
-def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
-    """A perfect render has the capped PSNR, and a method without depth has no depth error."""
-    batch = example_batch()
-    rows = measure(lambda b: Estimate(b.targets.images), "perfect", [batch], OFF)
-    assert rows[0]["psnr"] == pytest.approx(100)
-    assert rows[0]["flip"] == 0
-    assert rows[0]["depth_error_mm"] is None
-
-
 def test_what_is_not_finite_is_counted_and_named():
     """No renderer draws it, and no depth error counts it."""
     batch = dataclasses.replace(make_batch(2, 3), subjects=("anna", "ben"))
@@ -104,7 +82,10 @@ def test_what_refines_takes_part_in_what_is_measured():
     for refinement, cameras, share in ((halved, None, 2), (None, darker, 4), (halved, darker, 8)):
         method = ModelMethod(Standin(), flat_renderer, refinement, cameras)
         with torch.no_grad():
-            torch.testing.assert_close(method(batch).image, given / share)
+            estimate = method(batch)
+        torch.testing.assert_close(estimate.image, given / share)
+        # Refined Gaussians have left the predicted depths.
+        assert (estimate.depth is None) == (refinement is not None)
 
 
 def test_depth_errors_are_those_of_the_subject():

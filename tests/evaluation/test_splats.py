@@ -61,20 +61,6 @@ def test_discs_are_those_that_the_recurrent_model_starts_from():
         torch.testing.assert_close(value, getattr(expected, field.name), msg=lambda m, f=field: f.name + m)
 
 
-def test_discs_draw_the_surface_better_than_round_splats():
-    """At twice the size of the inputs, too, and between two of them."""
-    inputs, seen = (ring(1, n, 56, 56) for n in (4, 8))
-    images, masks, depths = painted_ellipsoid(inputs)
-    for cameras in (seen, seen.resized(112, 112)):
-        cameras = cameras[:, 1:2]
-        truth, inside, _ = painted_ellipsoid(cameras)
-        batch = Batch(images, masks, inputs, depths=depths, targets=Targets(truth, inside, cameras))
-        splats = RENDERER(splats_at(batch, batch.depths, batch.masks), cameras)
-        discs = splatted(batch, true_depth, RENDERER)
-        found = [psnr(drawn.image[0], truth[0]).item() for drawn in (splats, discs)]
-        assert found[1] > found[0] + 3
-
-
 def test_pixels_that_show_little_of_the_subject_have_discs_too():
     """Their opacity is the matte: without them outlines would end at half a pixel."""
     batch = with_soft_rims(make_batch(1, 2))
@@ -112,15 +98,6 @@ def test_the_hull_of_a_convex_body_approaches_its_surface_with_more_views():
     assert many.median() > -1.6  # masks are dilated by a pixel
     assert few.median() < -2.4
     assert many.abs().mean() < 0.6 * few.abs().mean()
-
-
-def test_the_hull_is_found_once_for_all_baselines_and_empty_outside_the_subject():
-    """Photo-consistency and the start of per-scene fitting search in the same hull."""
-    batch = make_batch(2, 3)
-    depth = hull_depth(batch)
-    assert batch.once(hull_bounds) is batch.once(hull_bounds)
-    assert depth.shape == batch.masks.shape
-    assert (depth[~batch.masks] == 0).all()
 
 
 def photographed(views=8, height=64, width=56):

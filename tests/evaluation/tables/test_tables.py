@@ -77,13 +77,6 @@ def test_what_no_table_can_show_is_refused(runs, options, message, tmp_path):
         built(runs, options, tmp_path)
 
 
-def test_a_table_fits_a_terminal():
-    """Each number of views has a line of its own, also with marks and missing seeds."""
-    shown = [line for line in (EXPECTED / "rows.txt").read_text().splitlines() if line[:1] in ("✗", "✓")]
-    assert len(shown) == 4 * 3
-    assert max(map(len, shown)) <= 120
-
-
 def test_text_of_all_kinds_is_escaped():
     """No name of a run or file can break the LaTeX."""
     assert escape("a_b & 50% #1 {x} ^~\\ $") == (
@@ -176,11 +169,8 @@ def test_encoders_of_the_package_have_their_names(name):
 def test_the_example_of_the_documentation_is_read(tmp_path):
     """The documented file is valid, with subjects and with means."""
     rows = read_others(EXAMPLE)
-    by_subject = rows.dropna(subset="subject").set_index("subject")
-    assert by_subject["psnr"]["p1000001"] == 26.85
-    assert by_subject["psnr"].mean() == pytest.approx((27.31 + 26.85) / 2)
-    (mean,) = rows[rows["subject"].isna()].to_dict("records")
-    assert (mean["views"], mean["count"]) == (5, 6)
+    assert rows.set_index("subject")["psnr"]["p1000001"] == 26.85
+    assert rows[rows["subject"].isna()][["views", "count"]].to_numpy().tolist() == [[5, 6]]
 
 
 @pytest.mark.parametrize(
