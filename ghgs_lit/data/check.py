@@ -30,7 +30,7 @@ _SHOWN = 30
 
 
 @dataclass
-class Seen:
+class Reading:
     """Result of reading one photograph.
 
     Attributes:
@@ -38,7 +38,7 @@ class Seen:
         position: number of the camera.
         view: its number at the position.
         place: the photograph in messages.
-        problem: line that says what is wrong.
+        problem: line on what is wrong.
         has_body: whether the subject has a body.
         iou: of body and mask, in [0, 1] (:func:`overlap`); None: there is no body to compare.
         agreement: share of the mask that the other masks allow, where there is no body to compare.
@@ -50,7 +50,7 @@ class Seen:
     name: str
     position: int
     view: int
-    place: str
+    place: str = ""
     problem: str | None = None
     has_body: bool = False
     iou: float | None = None
@@ -61,53 +61,23 @@ class Seen:
 
 
 @dataclass
-class Phase:
-    """Results of a phase."""
-
-    reader: Reader
-    seen: list[Seen]
-
-    def known(self, key: str) -> list[float]:
-        """All known values of ``problem``, ``iou``, ``agreement`` or ``tall``."""
-        return [value for one in self.seen if (value := getattr(one, key)) is not None]
-
-    @property
-    def figures(self) -> dict[str, float]:
-        """Numbers of what was read, and means and least values of what is known."""
-        figures = {
-            "people": self.reader.people,
-            "subjects": len(self.reader.subjects),
-            "photos": len(self.seen),
-            "broken": len(self.known("problem")),
-            "bodies": len({one.name for one in self.seen if one.has_body}),
-        }
-        for key in ("iou", "agreement"):
-            if values := self.known(key):
-                figures |= {
-                    f"mean {key}": round(float(np.mean(values)), 3),
-                    f"least {key}": round(min(values), 3),
-                }
-        return figures
-
-
-@dataclass
 class Report:
     """Result of a check.
 
     Attributes:
-        phases: results by phase.
+        phases: by phase, numbers of what was read, and mean and least IoU and agreement.
         problems: lines ``<place>: expected ...; found ...`` that prevent training.
         notes: lines that do not.
     """
 
-    phases: dict[str, Phase] = field(default_factory=dict)
+    phases: dict[str, dict[str, float]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def show(self) -> None:
         """Print a line for each phase, problem and note."""
-        for name, phase in self.phases.items():
-            print(f"{name}: " + ", ".join(f"{title} {value}" for title, value in phase.figures.items()))
+        for name, figures in self.phases.items():
+            print(f"{name}: " + ", ".join(f"{title} {value}" for title, value in figures.items()))
         for title, lines in (("problem", self.problems), ("note", self.notes)):
             for line in lines[:_SHOWN]:
                 print(f"{title}: {line}")
@@ -116,8 +86,7 @@ class Report:
 
     def write(self, path: Path) -> None:
         """Write the report as JSON."""
-        phases = {name: phase.figures for name, phase in self.phases.items()}
-        path.write_text(json.dumps({**vars(self), "phases": phases}, indent=1))
+        path.write_text(json.dumps(vars(self), indent=1))
 
 
 @dataclass(frozen=True)
@@ -131,34 +100,37 @@ class _Readings(Dataset):
     def __len__(self) -> int:
         return len(self.listed)
 
-    def __getitem__(self, index: int) -> Seen:
-        photograph = self.listed[index]
-        name = photograph[0]
+    def __getitem__(self, index: int) -> Reading:
+        reading = Reading(*self.listed[index])
         try:
-            view = self.photographs.view(*photograph)
-            body = self.photographs.body(name)
-            seen = Seen(*photograph, self.photographs.reader.place(*photograph))
+            self._examine(reading)
         except InputError as error:
-            return Seen(*photograph, "", str(error))
-        seen.digest = hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest()
+            reading.problem = str(error)
+        return reading
+
+    def _examine(self, reading: Reading) -> None:
+        """Read and measure a photograph; InputError: it is missing, broken or implausible."""
+        photograph = reading.name, reading.position, reading.view
+        view = self.photographs.view(*photograph)
+        body = self.photographs.body(reading.name)
+        place = reading.place = self.photographs.reader.place(*photograph)
+        reading.digest = hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest()
         if body is not None:
-            seen.has_body = True
-            seen.tall = float(np.ptp(body, axis=0).max())
-            seen.iou = overlap(body, view)
-        if seen.iou is None:
-            seen.problem = implausible(view.mask)
-        elif seen.iou < self.min_iou:
+            reading.has_body = True
+            reading.tall = float(np.ptp(body, axis=0).max())
+            reading.iou = overlap(body, view)
+        problem = implausible(view.mask) if reading.iou is None else None
+        if reading.iou is not None and reading.iou < self.min_iou:
             least = f"IoU of {self.min_iou:.2f} or more"
-            seen.problem = f"expected the body in its mask ({least}); found IoU {seen.iou:.2f}"
+            problem = f"expected the body in its mask ({least}); found IoU {reading.iou:.2f}"
         brightest = int(view.image[view.mask].max())
-        if seen.problem is None and brightest < _BLACK:
+        if problem is None and brightest < _BLACK:
             found = f"black (no channel above {brightest} of 255)"
-            seen.problem = f"expected a photograph in the mask; found {found}"
-        if seen.problem is not None:
-            seen.problem = f"{seen.place}: {seen.problem}"
-        elif seen.iou is None:
-            seen.silhouette = silhouette(view)
-        return seen
+            problem = f"expected a photograph in the mask; found {found}"
+        if problem is not None:
+            raise InputError(f"{place}: {problem}")
+        if reading.iou is None:
+            reading.silhouette = silhouette(view)
 
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
@@ -175,6 +147,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
     dataset = data.dataset
     # Static cameras allow only one protocol.
     targets = CAMERAS if dataset.static_cameras else data.targets
+    readings: dict[str, list[Reading]] = {}
     for phase in PHASES:
         try:
             if phase == "train" and not dataset.has(phase):
@@ -185,14 +158,15 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
         except InputError as error:
             report.problems.append(str(error))
             continue
-        results = Phase(reader, _read(reader, targets, min_iou, data, f"checking {phase}"))
-        _compare_masks(results.seen, min_agreement)
-        report.phases[phase] = results
-        report.problems += reader.problems + results.known("problem")
-        report.notes += _notes(dataset.published.get(phase), phase, results)
-    report.problems += _in_both(str(dataset.root), report.phases)
+        readings[phase] = _read(reader, targets, min_iou, data, f"checking {phase}")
+        _compare_masks(readings[phase], min_agreement)
+        report.phases[phase] = _summarize(reader, readings[phase])
+        report.problems += reader.problems + _known(readings[phase], "problem")
+        report.notes += _notes(dataset.published.get(phase), phase, reader, readings[phase])
+    if len(readings) == len(PHASES):
+        report.problems += _find_leaks(str(dataset.root), *readings.values())
     try:
-        if not report.problems and "train" in report.phases:
+        if not report.problems and "train" in readings:
             data.training_sampler(targets)
         if not report.problems:
             data.evaluation_loader(targets=targets)
@@ -204,16 +178,8 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
 
 def _read(
     reader: Reader, targets: TargetProtocol, min_iou: float, data: PhotographsDataModule, label: str
-) -> list[Seen]:
-    """Read all photographs of a phase that its protocol may ask for.
-
-    Args:
-        reader: of the phase.
-        targets: their views are read even if no file of theirs exists.
-        min_iou: least IoU of a body's silhouette and a mask.
-        data: the data module, for its workers.
-        label: beside the bar.
-    """
+) -> list[Reading]:
+    """Read the photographs of a phase that exist or that a target protocol may ask for."""
     needed = {RING_VIEW} | targets.view_numbers
     listed = []
     for name, positions in reader.subjects.items():
@@ -228,15 +194,10 @@ def _read(
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 
 
-def _compare_masks(seen: Sequence[Seen], least: float) -> None:
-    """Find the agreement of masks without a body; at most one problem for each subject.
-
-    Args:
-        seen: photographs of a phase; ``agreement``, ``tall`` and ``problem`` are filled.
-        least: share of a mask that the other masks of its subject must allow.
-    """
-    by_subject: dict[str, list[Seen]] = {}
-    for one in seen:
+def _compare_masks(readings: Sequence[Reading], least: float) -> None:
+    """Fill in agreement and height of masks without a body; at most one problem for each subject."""
+    by_subject: dict[str, list[Reading]] = {}
+    for one in readings:
         if one.silhouette is not None:
             by_subject.setdefault(one.name, []).append(one)
     for several in by_subject.values():
@@ -249,13 +210,13 @@ def _compare_masks(seen: Sequence[Seen], least: float) -> None:
             _compare_subject(several, least)
 
 
-def _compare_subject(seen: Sequence[Seen], least: float) -> None:
-    silhouettes = [one.silhouette for one in seen]
+def _compare_subject(readings: Sequence[Reading], least: float) -> None:
+    silhouettes = [one.silhouette for one in readings]
     tall = height(silhouettes)
-    for one, share in zip(seen, SEARCH.shares(silhouettes), strict=True):
+    for one, share in zip(readings, SEARCH.shares(silhouettes), strict=True):
         one.agreement = share
         one.tall = tall if one.tall is None else one.tall
-    worst = min(seen, key=lambda one: one.agreement)
+    worst = min(readings, key=lambda one: one.agreement)
     if worst.agreement < least:
         worst.problem = (
             f"{worst.place}: expected a mask that the others of its subject allow ({least:.0%} of it or "
@@ -263,18 +224,38 @@ def _compare_subject(seen: Sequence[Seen], least: float) -> None:
         )
 
 
-def _notes(published: int | None, phase: str, results: Phase) -> list[str]:
-    subjects = results.reader.subjects
-    figures = results.figures
+def _known(readings: Sequence[Reading], key: str) -> list:
+    """All known values of an attribute."""
+    return [value for one in readings if (value := getattr(one, key)) is not None]
+
+
+def _summarize(reader: Reader, readings: Sequence[Reading]) -> dict[str, float]:
+    figures = {
+        "people": reader.people,
+        "subjects": len(reader.subjects),
+        "photos": len(readings),
+        "broken": len(_known(readings, "problem")),
+        "bodies": len({one.name for one in readings if one.has_body}),
+    }
+    for key in ("iou", "agreement"):
+        if values := _known(readings, key):
+            figures[f"mean {key}"] = round(float(np.mean(values)), 3)
+            figures[f"least {key}"] = round(min(values), 3)
+    return figures
+
+
+def _notes(published: int | None, phase: str, reader: Reader, readings: Sequence[Reading]) -> list[str]:
+    subjects = reader.subjects
+    bodies = len({one.name for one in readings if one.has_body})
     notes = []
-    if published is not None and figures["people"] != published:
-        notes.append(f"{phase}: expected {published} people as published; found {figures['people']}")
-    if figures["bodies"] < len(subjects):
+    if published not in (None, reader.people):
+        notes.append(f"{phase}: expected {published} people as published; found {reader.people}")
+    if bodies < len(subjects):
         notes.append(
             f"{phase}: expected a body for each of {len(subjects)} subjects; found "
-            f"{figures['bodies']} (no Chamfer term; cameras are checked by their masks alone)"
+            f"{bodies} (no Chamfer term; cameras are checked by their masks alone)"
         )
-    tall = np.median(results.known("tall") or [0.0])
+    tall = np.median(_known(readings, "tall") or [0.0])
     if tall > _TALLEST:
         notes.append(f"{phase}: expected metres; found subjects {tall:.0f} units tall (millimetres?)")
     most = max(map(len, subjects.values()), default=0)
@@ -285,17 +266,13 @@ def _notes(published: int | None, phase: str, results: Phase) -> list[str]:
     return notes
 
 
-def _in_both(root: str, phases: dict[str, Phase]) -> list[str]:
+def _find_leaks(root: str, train: Sequence[Reading], val: Sequence[Reading]) -> list[str]:
     """Problems: subjects, or photographs under different names, in both ``train`` and ``val``."""
-    if set(phases) != set(PHASES):
-        return []
-    train = phases["train"]
-    val = phases["val"]
-    both = sorted(set(train.reader.subjects) & set(val.reader.subjects))
+    both = sorted({one.name for one in train} & {one.name for one in val})
     lines = [f"{root}: expected each subject in train or in val; found {name!r} in both" for name in both]
-    trained = {one.digest: one for one in train.seen if one.digest is not None}
+    trained = {one.digest: one for one in train if one.digest is not None}
     repeated: dict[tuple[str, str], str] = {}
-    for one in val.seen:
+    for one in val:
         twin = trained.get(one.digest)
         if twin is not None and one.name not in both:
             line = f"{one.place}: expected a photograph that train has not; found {twin.place}"

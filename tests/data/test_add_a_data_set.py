@@ -110,7 +110,7 @@ def test_the_template_passes_the_check(project, monkeypatch):
     release = {"name": "release", "training_views": [2, 3, 4]}
     report = inspect(build(node(project), "data", **KEYS | {"targets": release}))
     assert report.problems == report.notes == []
-    assert [phase.figures["bodies"] for phase in report.phases.values()] == [2, 1]
+    assert [figures["bodies"] for figures in report.phases.values()] == [2, 1]
 
 
 def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
