@@ -6,6 +6,7 @@ workspaces; the process that holds the lock moves finished subjects to their pla
 (:mod:`ghgs_lit.data.layout`). Besides the files described there, ``<root>/rendering/`` has
 ``settings.json`` (the settings of the files), ``lock`` and ``tmp/`` (workspaces)."""
 
+import functools
 import json
 import logging
 import multiprocessing
@@ -14,8 +15,8 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -124,17 +125,6 @@ class RenderOptions(Options):
     are, for scans, whose textures are photographs with the light of their day."""
 
 
-@dataclass(frozen=True)
-class _Job:
-    source: PersonSource
-    rig: Rig
-    settings: RenderOptions
-    seed: int
-    phase: str
-    name: str
-    workspace: Path
-
-
 def everything(rig: Rig, settings: RenderOptions) -> dict:
     """All settings besides the seed that photographs of a person depend on.
 
@@ -171,31 +161,27 @@ def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
     return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render}
 
 
-def render_subject(job: _Job) -> tuple[_Job, str]:
-    """Render one person into its workspace.
-
-    Args:
-        job: the person, the rig and the settings.
-
-    Returns:
-        The job, and why the person is bad (empty: it is not).
-    """
+def render_person(
+    source: PersonSource, rig: Rig, settings: RenderOptions, seed: int, workspace: Path, name: str
+) -> str:
+    """Render one person into a folder; returns why the person is bad, or an empty text."""
     try:
-        _render(job)
+        _render(source, rig, settings, seed, workspace, name)
     except InputError as error:
-        return job, str(error)
-    return job, ""
+        return str(error)
+    return ""
 
 
-def _render(job: _Job) -> None:
-    settings = job.settings
-    rng = subject_rng(job.seed, job.name)
-    person = job.rig.place(job.source.load(job.name), rng)
-    yaws = job.rig.yaws(rng) + job.source.facing(job.name)
+def _render(
+    source: PersonSource, rig: Rig, settings: RenderOptions, seed: int, workspace: Path, name: str
+) -> None:
+    rng = subject_rng(seed, name)
+    person = rig.place(source.load(name), rng)
+    yaws = rig.yaws(rng) + source.facing(name)
     lights = LIGHTS.draw(rng)
     height, width = settings.size
     # A separate generator: heights, yaws and lights do not depend on what is varied.
-    rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
+    rig, poses = rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
     studio = Studio(person, None if settings.lights == "none" else lights, settings.samples)
     for position in range(len(yaws)) if settings.positions is None else settings.positions:
         index = (position, list(settings.views))
@@ -210,9 +196,9 @@ def _render(job: _Job) -> None:
                 extrinsics=cameras.extrinsics[n].numpy(),
                 matte=np.round(shot.alphas[n] * 255).astype(np.uint8),
             )
-            write_view(job.workspace, position_name(job.name, position), number, view, settings.quality)
+            write_view(workspace, position_name(name, position), number, view, settings.quality)
     if person.body_vertices is not None:
-        write_body(job.workspace, job.name, person.body_vertices)
+        write_body(workspace, name, person.body_vertices)
 
 
 def render_people(
@@ -269,21 +255,23 @@ def render_people(
         _request(notes, names)
         todo = []
         for phase, listed in names.items():
-            for name in notes.missing(phase, listed):
-                todo.append(_Job(source, rig, settings, seed, phase, name, workspaces / f"{phase}-{name}"))
-        console = Console(stderr=True)
-        label = f"rendering into {root}"
+            todo += [(phase, name) for name in notes.missing(phase, listed)]
+        render = functools.partial(render_person, source, rig, settings, seed)
+        folders = [workspaces / f"{phase}-{name}" for phase, name in todo]
+        reasons = _map(render, folders, [name for _, name in todo], workers)
+        progress = {"total": len(todo), "console": Console(stderr=True), "disable": not shown}
         bad = []
-        finished = _run(todo, workers)
         try:
-            for job, why in track(finished, label, total=len(todo), console=console, disable=not shown):
+            for (phase, name), why in zip(
+                todo, track(reasons, f"rendering into {root}", **progress), strict=True
+            ):
                 if why:
                     bad.append(why)
-                    log.warning("%s is not rendered: %s", job.name, why)
+                    log.warning("%s is not rendered: %s", name, why)
                 else:
-                    _publish(notes, job)
+                    _publish(notes, phase, name, workspaces / f"{phase}-{name}")
         finally:
-            finished.close()
+            reasons.close()
             shutil.rmtree(workspaces, ignore_errors=True)
     if bad:
         raise InputError(f"{min(bad)} ({len(bad)} of {len(todo)} people are bad; the others are rendered)")
@@ -324,37 +312,33 @@ def _request(notes: Completeness, names: Mapping[str, Sequence[str]]) -> None:
     write_text_atomically(notes.folder / "plan.json", json.dumps(plan, indent=1))
 
 
-def _publish(notes: Completeness, job: _Job) -> None:
+def _publish(notes: Completeness, phase: str, name: str, workspace: Path) -> None:
     """Move a subject to its place, then mark it as complete."""
     for kind in _KINDS:
-        for source in sorted((job.workspace / kind).glob("*")):
-            target = notes.root / job.phase / kind / source.name
+        for source in sorted((workspace / kind).glob("*")):
+            target = notes.root / phase / kind / source.name
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists():  # left by a run that was killed between two moves
                 shutil.rmtree(target)
             os.replace(source, target)
-    marker = notes.marker(job.phase, job.name)
+    marker = notes.marker(phase, name)
     marker.parent.mkdir(parents=True, exist_ok=True)
     marker.touch()
-    shutil.rmtree(job.workspace)
+    shutil.rmtree(workspace)
 
 
-def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
-    """Render people in several processes, or one after the other in this one.
-
-    Args:
-        jobs: one for each person.
-        workers: number of processes; None: one for each core; 0 or 1: only this one.
-
-    Yields:
-        Each job as it ends, and why its person is bad (empty: it is not).
+def _map(
+    render: Callable[[Path, str], str], folders: list[Path], names: list[str], workers: int | None
+) -> Iterator[str]:
+    """Results of ``render`` in the order of people, from ``workers`` processes; None: one for each core;
+    0 or 1: only this one.
 
     Raises:
         RuntimeError: a process died.
     """
-    workers = min(len(jobs), allowed_cores() if workers is None else workers)
+    workers = min(len(names), allowed_cores() if workers is None else workers)
     if workers < 2:
-        yield from map(render_subject, jobs)
+        yield from map(render, folders, names)
         return
     compile_kernels()  # before the workers would, each for itself
     use_known_start_method()
@@ -364,15 +348,11 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
         ProcessPoolExecutor(workers, context, initializer=start_worker) as pool,
     ):
         try:
-            futures = [pool.submit(render_subject, job) for job in jobs]
-            for future in as_completed(futures):
-                yield future.result()
+            yield from pool.map(render, folders, names)
         except BrokenProcessPool as error:
             raise RuntimeError(
                 f"a rendering process died: the script lacks `{_GUARD}`, or memory ran out (repeat to go on)"
             ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def start_worker() -> None:
