@@ -7,19 +7,15 @@ import unicodedata
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.data.view import View, encode_depth
-from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.types import Cameras
 from ghgs_people.photograph import Studio
 from ghgs_people.writing import write_body, write_view
-from tests.helpers.captures import refused, truncate
+from tests.helpers.captures import points_of, refused, truncate
 from tests.helpers.people import RIG, box_person
 
 SIZE = 56
@@ -62,9 +58,7 @@ def root(box, tmp_path):
 
 def on_box(view: View, person) -> np.ndarray:
     """Distance of unprojected depth to the surface of the box."""
-    height, width = view.mask.shape
-    cameras = Cameras(torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width)
-    points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask & (view.depth > 0)]
+    points = points_of(view)[view.mask & (view.depth > 0)]
     low, high = person.parts[0].vertices.min(0), person.parts[0].vertices.max(0)
     outside = np.maximum(np.maximum(low - points, points - high), 0)
     inside = np.minimum(points - low, high - points).min(-1)
@@ -284,30 +278,30 @@ def test_bad_files_are_named(root, damage, line):
 )
 def test_bodies_of_no_person_are_named(root, vertices, message):
     np.save(root / "train" / "smpl" / "box" / "vertices.npy", vertices)
-    with pytest.raises(InputError, match=rf"box/vertices\.npy: {message}"):
-        photographs(root).body("box")
+    refused(rf"box/vertices\.npy: {message}", lambda: photographs(root).body("box"))
 
 
-def test_missing_roots_and_phases(tmp_path):
+@pytest.mark.parametrize(
+    ("folder", "names", "line"),
+    [
+        ("nowhere", None, "nowhere: expected the root of a rendered data set; found no such folder"),
+        ("empty", None, "train/img: expected a folder <id>_<position>"),
+        ("other", None, "expected folders <id>_<position>; found none"),
+        ("other", ["x"], r"found 0 \(x is missing"),
+    ],
+)
+def test_missing_roots_and_phases(tmp_path, folder, names, line):
     """A wrong root, an empty phase and a missing subject are named."""
-    with pytest.raises(
-        InputError, match=r"nowhere: expected the root of a rendered data set; found no such folder"
-    ):
-        Layout(tmp_path / "nowhere", "train")
-    with pytest.raises(InputError, match=r"train/img: expected a folder <id>_<position>"):
-        Layout(tmp_path, "train")
-    (tmp_path / "train" / "img" / "unrelated").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"expected folders <id>_<position>; found none"):
-        Layout(tmp_path, "train")
-    with pytest.raises(InputError, match=r"found 0 \(x is missing"):
-        Layout(tmp_path, "train", names=["x"])
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "other" / "train" / "img" / "unrelated").mkdir(parents=True)
+    refused(line, lambda: Layout(tmp_path / folder, "train", names=names))
 
 
 def test_a_half_rendered_subject_is_refused(root):
     """Where this package renders, a subject without its mark is not whole."""
     (root / "rendering" / "done" / "train").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"expected 1 whole subjects; found 0 \(box is missing or half-rend"):
-        Layout(root, "train")
+    line = r"expected 1 whole subjects; found 0 \(box is missing or half-rend"
+    refused(line, lambda: Layout(root, "train"))
     lenient = Layout(root, "train", strict=False)
     assert not lenient.subjects
     assert "half-rendered" in str(lenient.problems[0])

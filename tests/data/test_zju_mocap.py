@@ -37,19 +37,6 @@ def test_bodies_project_into_every_mask(zju_root):
         assert min(shares) > 0.99
 
 
-def test_translations_are_millimetres(zju_root):
-    """Forgetting the unit would put the cameras kilometres away."""
-    cams = load_npy(zju_root / "CoreView_386" / "annots.npy")["cams"]
-    data = photographs(zju_root)
-    for k in (0, 11):
-        view = data.view("CoreView_386_000000", k)
-        np.testing.assert_allclose(view.extrinsics[:3, 3] * 1000, cams["T"][k][:, 0], rtol=1e-6)
-        distance = np.linalg.norm(
-            data.body("CoreView_386_000000").mean(0) + view.extrinsics[:3, :3].T @ view.extrinsics[:3, 3]
-        )
-        assert 2 < distance < 4
-
-
 @pytest.mark.parametrize(("camera", "mode"), [(0, "L"), (3, "RGB")])
 def test_any_label_is_the_performer(zju_root, camera, mode):
     """Label maps have many labels, in one channel or three; any but 0 is the performer."""
@@ -91,25 +78,6 @@ def test_undistortion_is_that_of_opencv():
     assert error.max() <= 4  # OpenCV rounds places to 1/32 px
     assert np.abs(OPENCV["image"].astype(int) - OPENCV["undistorted"]).mean() > 20
     assert mask.min() == 0
-
-
-def test_undistortion_comes_before_the_resize(zju_root):
-    """Lens coefficients belong to the stored size."""
-    whole = photographs(zju_root).view("CoreView_386_000000", 7)
-    half = photographs(zju_root, size=(SIZE // 2, SIZE // 2)).view("CoreView_386_000000", 7)
-    mean = whole.image.reshape(SIZE // 2, 2, SIZE // 2, 2, 3).mean((1, 3))
-    assert np.abs(half.image - mean).max() <= 1
-    bent = photographs(zju_root, undistorted=False).view("CoreView_386_000000", 7)
-    assert (bent.mask != whole.mask).any()
-    np.testing.assert_array_equal(bent.intrinsics, whole.intrinsics)
-
-
-def test_a_lens_without_distortion_leaves_photographs_alone(zju_root):
-    """The resampling itself shifts nothing."""
-    grid = undistorting_grid(half_centers(OPENCV["intrinsics"]), np.zeros(5), *OPENCV["image"].shape[:2])
-    image, mask = undistort(OPENCV["image"], np.full_like(OPENCV["image"][..., 0], 255), grid)
-    assert np.abs(image.astype(int) - OPENCV["image"]).max() <= 1
-    assert (mask[1:-1, 1:-1] == 255).all()
 
 
 def test_cameras_are_the_first_so_many(zju_root):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 from PIL import Image
 from scipy.ndimage import binary_dilation
@@ -18,6 +19,8 @@ from ghgs_lit.data.packed import Packs
 from ghgs_lit.data.reader import Photographs, Reader
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.types import Cameras
 from ghgs_people import figures
 
 _person = functools.lru_cache(figures.generate)
@@ -46,6 +49,17 @@ def build_data(name: str, root: Path, *overrides: str):
 def stored(data, phase: str, size: tuple[int, int] | None = None) -> Photographs:
     """The photographs of a data module, at their stored size unless ``size`` is given."""
     return Photographs(data.dataset.reader(phase), size)
+
+
+def camera_of(view: View) -> Cameras:
+    """The camera of a photograph."""
+    matrices = torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics)
+    return Cameras(*matrices, *view.mask.shape)
+
+
+def points_of(view: View) -> np.ndarray:
+    """World points [h, w, 3] of the depth map of a photograph."""
+    return unproject_maps(torch.from_numpy(view.depth), camera_of(view)).numpy()
 
 
 def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> None:

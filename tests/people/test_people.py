@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.errors import InputError
 from ghgs_people.figures import Person, TexturedMesh, generate
 from ghgs_people.figures.body import BODY_VERTICES, bone_transforms, load_body, skin
 from ghgs_people.figures.charts import chart
@@ -21,6 +20,7 @@ from ghgs_people.figures.meshing import (
 )
 from ghgs_people.figures.noise import Noise
 from ghgs_people.figures.place import CROTCH
+from tests.helpers.captures import refused
 
 MEGABYTE = 2**20
 
@@ -260,32 +260,34 @@ def test_people_in_motion_spread_bend_and_cross_their_legs():
     assert high[1] < high[0] - 0.08
 
 
-def test_negative_numbers_are_refused():
+@pytest.mark.parametrize(("seed", "index", "key"), [(-1, 0, "seed"), (0, -1, "index")])
+def test_negative_numbers_are_refused(seed, index, key):
     """The message names the number that is wrong."""
-    with pytest.raises(InputError, match="seed"):
-        generate(-1, 0)
-    with pytest.raises(InputError, match="index"):
-        generate(0, -1)
+    refused(key, lambda: generate(seed, index))
 
 
-def test_textured_mesh_refuses_other_shapes():
+SQUARE = {
+    "vertices": np.zeros((4, 3), np.float32),
+    "faces": np.array([[0, 1, 2], [0, 2, 3]]),
+    "uv": np.zeros((4, 2), np.float32),
+    "texture": np.zeros((2, 2, 3), np.uint8),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "line"),
+    [
+        ("uv", np.zeros((3, 2)), "uv: expected an array 4x2; found 3x2"),
+        ("faces", np.array([[0, 1, 4]]), "faces: expected indices"),
+        ("texture", np.zeros((2, 2, 3)), r"texture: expected uint8 \[h, w, 3\]; found 'float64 \[2, 2, 3\]'"),
+        ("vertices", np.full((4, 3), np.nan), "vertices: expected finite numbers"),
+    ],
+)
+def test_textured_mesh_refuses_other_shapes(name, array, line):
     """Arrays that do not fit together are refused when the mesh is made,
     not when it is rendered."""
-    square = {
-        "vertices": np.zeros((4, 3), np.float32),
-        "faces": np.array([[0, 1, 2], [0, 2, 3]]),
-        "uv": np.zeros((4, 2), np.float32),
-        "texture": np.zeros((2, 2, 3), np.uint8),
-    }
-    TexturedMesh(**square)
-    with pytest.raises(InputError, match="uv: expected an array 4x2; found 3x2"):
-        TexturedMesh(**{**square, "uv": np.zeros((3, 2))})
-    with pytest.raises(InputError, match="faces: expected indices"):
-        TexturedMesh(**{**square, "faces": np.array([[0, 1, 4]])})
-    with pytest.raises(InputError, match=r"texture: expected uint8 \[h, w, 3\]; found 'float64 \[2, 2, 3\]'"):
-        TexturedMesh(**{**square, "texture": np.zeros((2, 2, 3))})
-    with pytest.raises(InputError, match="vertices: expected finite numbers"):
-        TexturedMesh(**{**square, "vertices": np.full((4, 3), np.nan)})
+    TexturedMesh(**SQUARE)
+    refused(line, lambda: TexturedMesh(**{**SQUARE, name: array}))
 
 
 # ---- mesh operations

@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from PIL import Image
 from trimesh.visual import TextureVisuals
@@ -13,10 +12,9 @@ from trimesh.visual.material import PBRMaterial
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.types import Cameras
 from ghgs_people.scans import ScanSource
-from tests.helpers.people import TINY, render_boxes, rendered, write_obj_scan
+from tests.helpers.captures import points_of, refused
+from tests.helpers.people import render_boxes, write_obj_scan
 
 
 def test_obj_scans_are_loaded_as_they_are(tmp_path):
@@ -60,8 +58,8 @@ def test_names_of_windows_programs(tmp_path):
     assert ScanSource(tmp_path).names() == ["a"]
     for said in ("-s 2 1 1 skin.jpeg", "-blendu on -o 0.5 0 0 skin.jpeg", "-clamp on skin.jpeg"):
         (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
-        with pytest.raises(InputError, match="expected map_Kd without -s, -o, -t and -clamp; found '-"):
-            ScanSource(tmp_path).load("a")
+        line = "expected map_Kd without -s, -o, -t and -clamp; found '-"
+        refused(line, lambda: ScanSource(tmp_path).load("a"))
 
 
 def test_folders_with_meshes_of_other_names_are_named(tmp_path, caplog):
@@ -83,8 +81,7 @@ def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
     path.write_text("\n".join([*lines[:second], "usemtl other", *lines[second:]]))
     mtl = "newmtl material0\nmap_Kd material0.jpeg\nnewmtl other\nmap_Kd lost.png\n"
     (tmp_path / "a" / "material0.mtl").write_text(mtl)
-    with pytest.raises(InputError, match=r"a\.obj: expected a texture for the mesh .*; found none"):
-        ScanSource(tmp_path).load("a")
+    refused(r"a\.obj: expected a texture for the mesh .*; found none", lambda: ScanSource(tmp_path).load("a"))
 
 
 def test_glb_scans_keep_parts_and_frames(tmp_path):
@@ -152,32 +149,40 @@ def test_a_gltf_file_that_would_be_read_as_another_mesh_is_named_with_its_cure(
     content = json.dumps(change).encode()
     header = b"glTF" + np.array([2, 20 + len(content), len(content)], "<u4").tobytes() + b"JSON"
     path.write_bytes((header if binary else b"") + content)
-    with pytest.raises(InputError, match=rf"{path.name}: {line}"):
-        ScanSource(tmp_path).load("g")
+    refused(f"{path.name}: {line}", lambda: ScanSource(tmp_path).load("g"))
 
 
-def test_bad_scans_are_named(tmp_path):
+BAD = {
+    "far away": (
+        lambda path: path.write_text(re.sub(r"(?m)^v \S+", "v 1e30", path.read_text(), count=1)),
+        r"a\.obj: .*: expected coordinates below 1e\+06; found",
+    ),
+    "no mesh": (lambda path: path.write_text("f 1 2 3\n"), r"a\.obj: expected"),
+    "no file": (lambda path: path.unlink(), r"a: expected a\.obj or a\.glb; found neither"),
+    "flat body": (
+        lambda path: np.save(path.with_name("body_vertices.npy"), np.zeros((5, 2))),
+        r"body_vertices\.npy: expected an array nx3; found 5x2",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_scans_are_named(tmp_path, kind):
     """Every defect of a scan is reported with its path."""
-    with pytest.raises(InputError, match="nowhere: expected a folder of scans; found no such folder"):
-        ScanSource(tmp_path / "nowhere").names()
-    with pytest.raises(InputError, match=r"expected <id>/<id>\.obj or <id>/<id>\.glb; found none"):
-        ScanSource(tmp_path).names()
-    path = write_obj_scan(tmp_path, "bare", textured=False)
-    with pytest.raises(InputError, match=r"bare\.obj: expected a texture for the mesh .*; found none"):
-        ScanSource(tmp_path).load("bare")
-    far = write_obj_scan(tmp_path, "far")
-    far.write_text(re.sub(r"(?m)^v \S+", "v 1e30", far.read_text(), count=1))
-    with pytest.raises(InputError, match=r"far\.obj: .*: expected coordinates below 1e\+06; found"):
-        ScanSource(tmp_path).load("far")
-    path.write_text("f 1 2 3\n")
-    with pytest.raises(InputError, match=r"bare\.obj: expected"):
-        ScanSource(tmp_path).load("bare")
-    with pytest.raises(InputError, match=r"other: expected other\.obj or other\.glb; found neither"):
-        ScanSource(tmp_path).load("other")
-    write_obj_scan(tmp_path, "body")
-    np.save(tmp_path / "body" / "body_vertices.npy", np.zeros((5, 2)))
-    with pytest.raises(InputError, match=r"body_vertices\.npy: expected an array nx3; found 5x2"):
-        ScanSource(tmp_path).load("body")
+    damage, line = BAD[kind]
+    damage(write_obj_scan(tmp_path, "a"))
+    refused(line, lambda: ScanSource(tmp_path).load("a"))
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("nowhere", "nowhere: expected a folder of scans; found no such folder"),
+        ("", r"expected <id>/<id>\.obj or <id>/<id>\.glb; found none"),
+    ],
+)
+def test_folders_without_scans_are_named(tmp_path, name, line):
+    refused(line, ScanSource(tmp_path / name).names)
 
 
 def test_rendered_scans_share_one_transform(tmp_path):
@@ -190,20 +195,6 @@ def test_rendered_scans_share_one_transform(tmp_path):
     for position in layout.subjects["s0"][::5]:
         for number in layout.views_at("s0", position):
             view = layout.read_view("s0", position, number, depth=True)
-            height, width = view.mask.shape
-            cameras = Cameras(
-                torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width
-            )
-            points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask]
+            points = points_of(view)[view.mask]
             assert (points > body.min(0) - 0.05).all()
             assert (points < body.max(0) + 0.05).all()
-
-
-def test_a_split_chooses_among_rendered_scans(tmp_path):
-    """Another file measured the same subjects, and a missing one was not noticed."""
-    render_boxes(tmp_path / "out", tmp_path / "scans", train=2, val=1, settings=TINY.replace(positions=(0,)))
-    assert list(rendered(tmp_path / "out").subjects("val")) == ["s2"]
-    data = rendered(tmp_path / "out", split={"train": ["s2"], "val": ["s0", "s1"]})
-    assert [list(data.subjects(phase)) for phase in ("train", "val")] == [["s2"], ["s0", "s1"]]
-    with pytest.raises(InputError, match=r"none: expected a folder with split_train\.txt"):
-        rendered(tmp_path / "out", split=tmp_path / "none").subjects("val")
