@@ -1,4 +1,4 @@
-"""What a GPU would be asked for, by stage: calls, launches (calls that are no views), waits of the host.
+"""Work of a GPU by stage: calls, kernel launches (calls that are no views), device-to-host synchronisations.
 
 Counted on the pretend device of the tests, without a GPU. A GPU starves where calls are many and small, and
 it idles where the host waits for a value. A list that is copied to the device makes the host wait, too.

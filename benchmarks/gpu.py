@@ -1,4 +1,4 @@
-r"""All that is worth measuring in the first minutes on a GPU: one prepared script for rented ones.
+r"""All measurements of the first minutes on a GPU: one prepared script for rented ones.
 
     python benchmarks/gpu.py --dry first second          # rehearse on the pretend device of the tests
     python benchmarks/gpu.py first                       # 420 s: predictions, steps, kernels, loader
@@ -10,8 +10,8 @@ Each section is a process of its own with a time limit. Findings are lines of JS
 ``<out>/<run>.jsonl`` as soon as they are known; a section that fails or takes too long is a
 row with its last lines, and the others go on. Sections that are named are one run, in their order,
 but that one which must wait for people lets the next one pass; ``--seconds`` ends it. Whether results that
-are played back are those of eager calls, for other inputs than the recorded ones, is a row with a
-verdict; a wrong one is said last, and the exit status is 1. In the background gsplat is compiled (its
+are replayed are those of eager calls, for other inputs than the captured ones, is a row with a
+verdict; a wrong one is printed last, and the exit status is 1. In the background gsplat is compiled (its
 kernels for up to 9 channels, for this GPU) and built-in people are rendered on all cores; they
 pause while a section measures what a busy host would spoil. Both lie in ``--work``, where the
 next call finds them.
@@ -87,7 +87,7 @@ RUNS = {
 
 
 class Background:
-    """A process beside the sections, in a session of its own, whose output is kept in a file."""
+    """A background process in its own session, whose output is kept in a file."""
 
     def __init__(self, command: list[str], environment: dict[str, str]):
         self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115
@@ -124,7 +124,7 @@ class Background:
 
 
 class Session:
-    """Sections of a run, one after another, beside the background."""
+    """Sections of a run, one after another, and the background processes."""
 
     def __init__(self, options: argparse.Namespace, rows: Rows, plans: dict[str, Plan], seconds: float):
         self.options, self.rows, self.plans = options, rows, plans
@@ -338,7 +338,7 @@ def show(folder: Path) -> None:
         print(f"\n# {file.stem}\n{report(rows)}")
         wrong += [f"{file.stem}: {row['row']}" for row in rows if row.get("verdict") == WRONG]
     if wrong:
-        sys.exit("\nWRONG, played back is not as eager:\n" + "\n".join(wrong))
+        sys.exit("\nWRONG, a replay is not as eager:\n" + "\n".join(wrong))
 
 
 if __name__ == "__main__":

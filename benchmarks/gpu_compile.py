@@ -72,8 +72,8 @@ class Compiler:
                 self.done.add(key)
                 source = ASTSource(fn=kernel, signature=signature, constexprs={**flags, **known})
                 compiled = triton.compile(source, GPUTarget("cuda", capability, 32), {"num_warps": num_warps})
-                said = [name.lower() for name, value in flags.items() if value is True]
-                title = " ".join((kernel.__name__.removesuffix("_rows"), *said))
+                switches = [name.lower() for name, value in flags.items() if value is True]
+                title = " ".join((kernel.__name__.removesuffix("_rows"), *switches))
                 print(f"{title}: {capability}, {_needs(compiled)}", flush=True)
 
 
@@ -93,8 +93,8 @@ def _needs(compiled: Any) -> str:
         path.write_text(compiled.asm["ptx"])
         target = re.search(r"^\.target (\w+)", compiled.asm["ptx"], re.MULTILINE)[1]
         command = [triton.knobs.nvidia.ptxas.path, "-v", f"-arch={target}", "-o", f"{path}.o", str(path)]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-    registers, spilled = re.search(r"Used (\d+) registers", said)[1], re.search(r"(\d+) bytes spill", said)
+        text = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    registers, spilled = re.search(r"Used (\d+) registers", text)[1], re.search(r"(\d+) bytes spill", text)
     return f"{registers} registers, {spilled[1] if spilled else 0} bytes spilled"
 
 

@@ -43,7 +43,7 @@ class Gpu:
         self.device, self.is_real = device, is_real
 
     def backend(self) -> CaptureBackend:
-        """What records: CUDA graphs; in a rehearsal a stand-in that repeats operators."""
+        """Captures calls: CUDA graphs; in a rehearsal a stand-in that repeats operators."""
         return CudaGraphs() if self.is_real else OperatorBackend(self.device.type)
 
     def milliseconds(self, call: Callable[[], Any], repeats: int) -> float:
@@ -186,7 +186,7 @@ DRY = Sizes(
     encoder="vggt_nano",
     shipped=(
         *("data.size=28", "data.render.samples=1", "encoder.width=48", "augmentation=none"),
-        "rounds.height=null",  # smaller copies would keep steps from being recorded
+        "rounds.height=null",  # smaller copies would keep steps from being captured
     ),
     repeats=1,
     copied=2**10,

@@ -1,4 +1,4 @@
-"""Whether what is played back is what an eager call gives, for inputs that were not recorded."""
+"""Compares replays of CUDA graphs with eager calls, for inputs that were not captured."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
@@ -12,13 +12,13 @@ from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.types import Batch
 
-#: Largest distance of two results that differ by rounding, beside ten times that of two eager calls.
+#: Largest distance of two results that differ by rounding, besides ten times that of two eager calls.
 ROUNDING = 1e-3
 WRONG = "WRONG"
 
 
 def other_scene(batch: Batch) -> Batch:
-    """A batch of the same class, with other colours, in a world that is moved by 20 cm."""
+    """A batch of the same shape bucket, with other colours, in a world that is moved by 20 cm."""
     extrinsics = batch.cameras.extrinsics.clone()
     extrinsics[..., :3, 3] += 0.2 * extrinsics[..., :3, 0]
     return replace(batch, images=0.6 * batch.images, cameras=replace(batch.cameras, extrinsics=extrinsics))
@@ -35,21 +35,21 @@ def apart(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
 
 
 def judged(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[Tensor]]) -> None:
-    """Row of a call that is played back, beside two eager ones.
+    """Row of a replayed call, compared with two eager ones.
 
     Args:
         call: of the section.
         name: of the row.
         cache: that has captured calls of this bucket.
-        run: gives the results on the CPU, of a call that may be played back (True) or is eager.
+        run: gives the results on the CPU, of a call that may be replayed (True) or is eager.
     """
     before = cache.counts["replayed"]
-    found, wanted, again = (run(may_be_played) for may_be_played in (True, False, False))
+    found, wanted, again = (run(may_replay) for may_replay in (True, False, False))
     numbers = {"apart": apart(found, wanted), "noise": apart(again, wanted)}
     # A number that is none is no small one.
     holds = numbers["apart"] <= max(ROUNDING, 10 * numbers["noise"])
-    is_played = cache.counts["replayed"] > before
-    verdict = ("as eager" if holds else WRONG) if is_played else "not played back"
+    is_replayed = cache.counts["replayed"] > before
+    verdict = ("as eager" if holds else WRONG) if is_replayed else "not replayed"
     call.add(f"{name}, replay beside eager", verdict=verdict, **numbers)
 
 
@@ -66,12 +66,12 @@ def judge_prediction(call: Call, name: str, predictor: Predictor, batch: Batch) 
         call: of the section.
         name: of the row.
         predictor: that has captured predictions of this bucket.
-        batch: of the class, on the device.
+        batch: of the shape bucket, on the device.
     """
     other, options = other_scene(batch), predictor.options
 
-    def predicted(may_be_played: bool) -> list[Tensor]:
-        capture = "auto" if may_be_played else "off"
+    def predicted(may_replay: bool) -> list[Tensor]:
+        capture = "auto" if may_replay else "off"
         predictor.options = options.replace(capture=capture)
         gaussians = predictor(other).gaussians
         values = [getattr(gaussians, field.name) for field in fields(gaussians)]
@@ -87,14 +87,14 @@ def judge_step(call: Call, name: str, step: Any) -> None:
     Args:
         call: of the section.
         name: of the row.
-        step: of :mod:`benchmarks.gpu_sections`, which has recorded steps of this class.
+        step: of :mod:`benchmarks.gpu_sections`, which has captured steps of this shape bucket.
     """
     batch, step.host = step.host, other_scene(step.host)
     step.data()
 
-    def differentiated(may_be_played: bool) -> list[Tensor]:
+    def differentiated(may_replay: bool) -> list[Tensor]:
         step.optimizer.zero_grad()
-        total = step.played() if may_be_played else step.called()
+        total = step.replayed() if may_replay else step.called()
         total.backward()
         slopes = [weight.grad for weight in step.model.parameters() if weight.grad is not None]
         return here([total, *slopes])
@@ -105,12 +105,12 @@ def judge_step(call: Call, name: str, step: Any) -> None:
 
 @torch.no_grad()
 def judge_optimizer(call: Call, name: str, step: Any) -> None:
-    """Row of what the recorded step of the optimizer changes, along other gradients.
+    """Row of what the captured step of the optimizer changes, along other gradients.
 
     Args:
         call: of the section.
         name: of the row.
-        step: of :mod:`benchmarks.gpu_sections`, whose optimizer has recorded its step.
+        step: of :mod:`benchmarks.gpu_sections`, whose optimizer has captured its step.
     """
     optimizer, cache = step.optimizer, getattr(step.optimizer, "graphs", None)
     if cache is None:
@@ -120,10 +120,10 @@ def judge_optimizer(call: Call, name: str, step: Any) -> None:
     before = [tensor.clone() for tensor in written]
     moved = [weight for weight in weights if weight in optimizer.state]
 
-    def stepped(may_be_played: bool) -> list[Tensor]:
+    def stepped(may_replay: bool) -> list[Tensor]:
         for number, weight in enumerate(moved):
             weight.grad = weight.detach().roll(1).mul(0.5 + number % 3)
-        optimizer.graphs = cache if may_be_played else None
+        optimizer.graphs = cache if may_replay else None
         optimizer.step()
         changes = [new - old for new, old in zip(here(weights), here(before[: len(weights)]), strict=True)]
         for tensor, value in zip(written, before, strict=True):

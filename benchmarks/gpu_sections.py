@@ -76,7 +76,7 @@ def _predicted(
 
 
 def prediction(call: Call) -> None:
-    """A prediction of the weights that come with the package, eager and played back"""
+    """A prediction of the weights that come with the package, eager and replayed"""
     predictor = _capturing(call, Predictor.from_checkpoint(map_location=call.gpu.device))
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
@@ -156,15 +156,15 @@ class _Step:
                 part()
         return self.total
 
-    def played(self) -> Tensor:
-        """The loss, with stages, rendering and gradients played back."""
+    def replayed(self) -> Tensor:
+        """The loss, with stages, rendering and gradients replayed."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             return self.captured_step(self.batch).total
 
     def captured(self) -> None:
-        """The step, played back."""
+        """The replayed step."""
         self.data()
-        self.played().backward()
+        self.replayed().backward()
         self.optimize()
 
     @property
@@ -187,7 +187,7 @@ def _stepped(call: Call, name: str, step: _Step) -> None:
 
 
 def _captured(call: Call, name: str, step: _Step) -> None:
-    """Rows of a step that is played back: how long it takes, and whether it is as eager."""
+    """Rows of a replayed step: how long it takes, and whether it is as eager."""
     ms = call.gpu.milliseconds(step.captured, call.sizes.repeats)
     cache = step.captured_step.graphs
     work = call.gpu.work(step.captured, 2)
@@ -238,7 +238,7 @@ class _Calls(TorchDispatchMode):
 
 
 def kernels(call: Call) -> None:
-    """Kernels in Triton, the same eager and compiled, beside the rate of a copy; attention by backend"""
+    """Kernels in Triton, the same eager and compiled, with the rate of a copy; attention by backend"""
     predictor = Predictor.from_checkpoint(map_location=call.gpu.device)
     batch = replace(call.batch(max(call.sizes.batches), call.sizes.side), targets=None).to(call.gpu.device)
     predictor.precision = "tf32"

@@ -1,4 +1,4 @@
-"""Power and false stars of ``ghgs table`` in tables that are drawn by chance.
+"""Power and false stars of ``ghgs table`` in randomly sampled tables.
 
     python benchmarks/table_power.py [number of tables]
 
@@ -113,9 +113,9 @@ def main(trials: int = 100) -> None:
             power = [*alone, *tables(PAPER, [1] * 4, seeds, way, trials)[0].mean(axis=0)]
             print(f"| {way} | {seeds} | {' | '.join(f'{share:.0%}' for share in power)} |")
     for seeds in (3, 5):
-        said = tables([0] * 4, [1] * 4, seeds, "pooled", trials)[1]
-        found = tables([0, said, 0, 0], [1] * 4, seeds, "pooled", trials, start=1)[0]
-        print(f"\n{seeds} seeds could have shown {said:.2f} dB: found in {found[:, 0].mean():.0%}")
+        smallest = tables([0] * 4, [1] * 4, seeds, "pooled", trials)[1]
+        found = tables([0, smallest, 0, 0], [1] * 4, seeds, "pooled", trials, start=1)[0]
+        print(f"\n{seeds} seeds could have shown {smallest:.2f} dB: found in {found[:, 0].mean():.0%}")
     print(f"\n{trials} tables each, {time.perf_counter() - started:.0f} s")
 
 

@@ -6,7 +6,7 @@
     python scripts/check_documents.py --list                   # what would be run, and what not and why
 
 Commands are the lines of ``bash`` blocks, ``python`` blocks as a whole, and commands in running text. Each
-document gets an empty folder with links to what a checkout has. Three tables say where a run differs from the
+document gets an empty folder with links to what a checkout has. Three tables list where runs differ from the
 text: NOT_RUN (left out, with the reason), SMALL (small settings, and stand-ins for files of the reader) and
 BEFORE (what a document expects to be there). One line is printed for each command; the exit code is 1 if one
 fails.
@@ -99,7 +99,7 @@ SMALL = [
     (r"refine=15", "refine=2", "two steps"),
     (r"^(ghgs predict .*)", r"\1 turntable.frames=2", "two pictures"),
     (r"^(ghgs predict data=.*)", r"\1 data.size=112", "112 x 112 pixels"),
-    (r"(?<==)/data/", "", "folders beside this one"),
+    (r"(?<==)/data/", "", "folders next to this one"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
     (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
@@ -110,7 +110,7 @@ SMALL = [
     (r"<checkpoint>", "shipped", "the weights that come with the package"),
     (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
     (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
-    (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "beside the miniature"),
+    (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "next to the miniature"),
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1 data.render_workers=0",
      "small photographs"),
@@ -118,7 +118,7 @@ SMALL = [
     (r"^(.*miniature\.py.*)", rf"\1 {FEW}", "few people"),
     (r"^(python benchmarks/captures\.py.*)", r"\1 --people 1", "one person"),
     (r"^(ghgs train (?!.*dry_run).*sweep=table\d.*)", r"\1 dry_run=true", "needs a GPU: planned only"),
-    (r"^(ghgs train .*sweep=table\d.*dry_run=true.*)", r"\1 || [ $? = 1 ]", "says what it lacks here"),
+    (r"^(ghgs train .*sweep=table\d.*dry_run=true.*)", r"\1 || [ $? = 1 ]", "reports what it lacks here"),
     (r"(?<=seed=1,2),3(,4)?", "", "two seeds"),
     (TRAIN + r".*(?:experiment=(?:demo|shipped)|data=synthetic).*)", rf"\1 {TINY}",
      "two people of 56 x 56 pixels"),
@@ -282,7 +282,7 @@ def documents() -> list[str]:
 
 
 def commands(document: str) -> list[Command]:
-    """The commands of a document in the order of the text; one that is said twice counts once."""
+    """The commands of a document in the order of the text; repeated ones count once."""
     text = (ROOT / document).read_text()
     found = [*_in_blocks(document, text), *_in_prose(document, text)]
     first: dict[str, Command] = {}

@@ -54,7 +54,7 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
 
 
 class Lossy(OperatorBackend):
-    """Repeats nothing of what an operator does from its ``first`` call on, as if it were not recorded."""
+    """Repeats nothing of what an operator does from its ``first`` call on, as if it were not captured."""
 
     def __init__(self, device, operator, first):
         super().__init__(device)
@@ -101,7 +101,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
     [row] = rows.read()
     assert row["verdict"] == ("as eager" if planted is None else WRONG)
     monkeypatch.setattr(sys, "argv", ["gpu.py", "--table", str(tmp_path)])
-    with nullcontext() if planted is None else pytest.raises(SystemExit, match="WRONG, played back"):
+    with nullcontext() if planted is None else pytest.raises(SystemExit, match="WRONG, a replay"):
         gpu.main()
 
 

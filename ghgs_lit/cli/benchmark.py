@@ -108,7 +108,7 @@ def check_options(run: "Benchmark", given: Sequence[str]) -> None:
     of_model = [name for name in (*KNOBS, "ablation", "compat") if name not in _APPLIED]
     for key in map(key_of, given if run.checkpoint else ()):
         if is_below(key, of_model):
-            raise InputError(f"{key}: expected no option of the model beside a checkpoint (knobs={{...}})")
+            raise InputError(f"{key}: expected no option of the model with a checkpoint (knobs={{...}})")
 
 
 def configured_cases(run: "Benchmark", device: torch.device) -> list[Case]:

@@ -21,7 +21,7 @@ Line = tuple[str, str]
 
 
 def processor_name() -> str:
-    """Model name of the processor; on other systems than Linux what Python knows of it."""
+    """Model name of the processor; on other systems than Linux as Python reports it."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -72,7 +72,7 @@ def machine_lines(device: torch.device) -> list[Line]:
         ("memory", decimal(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))),
         *_gpus(),
         ("renderer", _gsplat_state()),
-        ("compiled kernels", os.environ.get("NUMBA_CACHE_DIR") or "beside the package's sources"),
+        ("compiled kernels", os.environ.get("NUMBA_CACHE_DIR") or "next to the package's sources"),
     ]
 
 

@@ -195,7 +195,7 @@ def true_depth(batch: Batch) -> Tensor:
     """Depth maps of the data.
 
     Args:
-        batch: With depths, where the data knows them.
+        batch: With depths, where the data has them.
 
     Returns:
         Depths [B, V, H, W], metres.

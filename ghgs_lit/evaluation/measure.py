@@ -90,7 +90,7 @@ def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
     """Count what is not finite; a warning names the subjects that have any.
 
     Args:
-        batch: Of B subjects; its masks say where depths count.
+        batch: Of B subjects; depths count inside its masks.
         prediction: Of that batch.
 
     Returns:

@@ -21,7 +21,7 @@ print_once = cache(print)
 #: Printed metrics and their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "psnr_edge": 2, "ssim": 4, "lpips": 4, "flip": 4}
 PRINTED |= {"spill": 1, "sharpness": 2, "depth_error_mm": 1, "seconds": 2}
-#: Units in the heads of printed metrics whose names do not say them.
+#: Units in the heads of printed metrics whose names lack them.
 _UNITS = dict.fromkeys(("psnr", "psnr_box", "psnr_edge"), "\ndB") | {"spill": "\n‰"}
 #: Descriptions of splits for readers of the results.
 SPLITS = {

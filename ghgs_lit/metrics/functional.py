@@ -182,7 +182,7 @@ def ssim(
 def spill(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, " n"]:
-    """Light that is drawn beside the subject, farther than :data:`BESIDE` pixels from its mask.
+    """Light that is rendered outside the subject, farther than :data:`BESIDE` pixels from its mask.
 
     Args:
         image: renders on black.

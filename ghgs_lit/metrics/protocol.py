@@ -199,7 +199,7 @@ class ImageMetrics:
 
     @property
     def definitions(self) -> dict[str, str]:
-        """How each metric and region is defined, to be stored beside the numbers."""
+        """How each metric and region is defined, to be stored with the numbers."""
         options = self.options
         renders = {"release": "as they are", "files": "and targets in 8 bits"}
         renders = renders.get(options.protocol, "clamped to [0, 1]")

@@ -94,7 +94,7 @@ def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
 
 def depth_edges(depth: Float[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
     """Pixels on both sides of an edge of depth:
-    beside a neighbour :data:`DEPTH_STEP` nearer or farther.
+    next to a neighbour :data:`DEPTH_STEP` nearer or farther.
 
     Args:
         depth: z in metres; 0 is unknown, and no edge.

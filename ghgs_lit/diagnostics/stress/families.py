@@ -262,7 +262,7 @@ def sphere(family: str, g: Generator, views: int, size: int, target: bool = Fals
         target: whether there is a target view, too.
 
     Returns:
-        ``images`` [v, 3, s, s], ``masks`` and ``truth`` [v, s, s] (true depths, 0 beside the
+        ``images`` [v, 3, s, s], ``masks`` and ``truth`` [v, s, s] (true depths, 0 outside the
         sphere), and what :func:`rig` has; with a target ``target`` [1, 3, s, s],
         ``target_lenses`` and ``target_poses``.
     """

@@ -37,7 +37,7 @@ def fill(table: Table) -> None:
     cells["mean"] = cells["mean"].fillna(_reported(table))
     cells["lacking"] = _lacking(table, cells["seeds"])
     table.cells = cells.assign(best=False, marked=False, test=None)
-    # Without baselines, some of which know the truth.
+    # Without baselines, some of which are given the truth.
     competing = [i for i, line in enumerate(table.lines) if line.variant.kind in ("model", "other")]
     competing = cells["mean"].dropna().loc[lambda means: means.index.isin(competing, level="line")]
     for column, means in competing.groupby(CELL[1:]):

@@ -18,7 +18,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 POWER = 0.8
-"""Share of tables that find the smallest difference which is said below a table."""
+"""Power of the smallest difference that is printed below a table."""
 RATIO = 2.0
 """Ratio of the deviations of rows over seeds up to which the level holds."""
 
