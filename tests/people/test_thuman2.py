@@ -5,10 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.mask_checks import overlap
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_people import figures
 from ghgs_people.figures.mesh import Person
@@ -18,7 +16,7 @@ from ghgs_people.rig import Rig
 from ghgs_people.thuman2 import THuman2, THuman2Source, find_fits
 from scripts.miniatures import thuman2 as miniature
 from scripts.miniatures.scans import make_scans, scan_of
-from tests.helpers.captures import camera_of, points_of, stored
+from tests.helpers.captures import camera_of, stored
 from tests.helpers.people import V4
 
 SIZE = 96
@@ -66,53 +64,6 @@ def test_own_renders_have_half_pixel_centres(raw, tmp_path):
     assert data.dataset.render_missing() == 2
     K = stored(data, "train").view("0000", 0, 0).intrinsics
     np.testing.assert_allclose(K[:2, 2], [24, 24 + 48 * 25 / 1024], atol=1e-5)
-
-
-def test_the_principal_point_is_25_pixels_of_1024_below_the_middle_and_resizes(rendered):
-    """The published principal point, at any size."""
-    K = stored(module(rendered), "train").view("0000", 0, 0).intrinsics
-    np.testing.assert_allclose([K[0, 0], K[1, 1]], 0.8 * SIZE, rtol=1e-6)
-    np.testing.assert_allclose(K[:2, 2] - 0.5, [SIZE / 2, SIZE / 2 + SIZE * 25 / 1024], atol=1e-5)
-    half = stored(module(rendered), "train", (SIZE // 2, SIZE // 2)).view("0000", 0, 0).intrinsics
-    np.testing.assert_allclose(half[:2], K[:2] / 2, rtol=1e-6)
-
-
-def test_depth_is_inverse_and_scaled_by_2_to_the_15(rendered):
-    """Published depth files unproject to the body."""
-    reader = stored(module(rendered), "train")
-    view, body = reader.view("0000", 5, 0), reader.body("0000")
-    points = points_of(view)[view.mask]
-    low, high = body.min(0) - 0.1, body.max(0) + 0.1
-    assert ((points > low) & (points < high)).all(-1).mean() > 0.99
-    assert np.median(np.linalg.norm(points[:, None] - body[None, ::20], axis=-1).min(1)) < 0.08
-
-
-def test_every_view_sees_the_body_in_its_mask(rendered):
-    """Cameras, bodies and masks of all 80 views agree."""
-    for phase in ("train", "val"):
-        photographs = stored(module(rendered), phase)
-        reader = photographs.reader
-        fits = [
-            overlap(photographs.body(name), photographs.view(name, position, view))
-            for name, positions in reader.subjects.items()
-            for position in positions
-            for view in reader.views_at(name, position)
-        ]
-        assert len(fits) == 80
-        assert min(fits) > 0.75
-
-
-def test_files_are_of_the_published_types(rendered):
-    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras;
-    ``_hr`` files are not views."""
-    train = rendered / "train"
-    mask = np.asarray(Image.open(train / "mask/0000_004/2.png"))
-    assert mask.shape == (SIZE, SIZE, 3)
-    assert set(np.unique(mask)) == {0, 255}
-    assert np.asarray(Image.open(train / "depth/0000_004/2.png")).dtype == np.uint16
-    assert np.load(train / "parm/0000_004/2_extrinsic.npy").shape == (3, 4)
-    assert Image.open(train / "img/0000_004/2_hr.jpg").size == (2 * SIZE, 2 * SIZE)
-    assert stored(module(rendered), "train").reader.views_at("0000", 4) == [0, 1, 2, 3, 4]
 
 
 def test_the_first_camera_faces_the_person(raw):
