@@ -1,17 +1,26 @@
-"""Options of data sets: one flat mapping, checked,
-with the keys of the data set and of its batches."""
+"""Options of data sets, splits of subjects, and the processes that load batches."""
 
+import logging
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from ghgs_lit.data.batches import automatic_workers, loader_of
 from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.data.humman import HuMMan
+from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_people.datasets import Scans, Synthetic
-from tests.helpers.people import TINY, rendered
+from tests.helpers.captures import refused
+from tests.helpers.people import TINY, equal, rendered
 
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
@@ -83,3 +92,177 @@ def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch)
         assert list(batches[step].subjects) == expected
     monkeypatch.setattr("ghgs_lit.data.datamodule.LEAST_STEPS", 1)
     assert len(data.train_dataloader().dataset) == 2  # of the three subjects, each process has half
+
+
+NAMES = [f"s{i}" for i in range(10)]
+
+
+def test_a_share_of_the_scans_is_drawn(tmp_path):
+    """By the seed, where neither files nor lists decide."""
+    drawn = split_names(tmp_path, NAMES, None, 0.2, 0)
+    assert sorted(drawn["train"] + drawn["val"]) == NAMES
+    assert len(drawn["val"]) == 2
+    assert drawn == split_names(tmp_path, NAMES, None, 0.2, 0)
+    assert drawn != split_names(tmp_path, NAMES, None, 0.2, 1)
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Folders of split files: with both, without the second, with one id in both."""
+    for name, val in (("both", "s3\n"), ("one", None), ("twice", "s2\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "split_train.txt").write_text("s1\ns2\n")
+        if val:
+            (tmp_path / name / "split_val.txt").write_text(val)
+    return tmp_path
+
+
+def test_files_and_lists_decide(folders):
+    """Files beside the scans before a draw; what is configured before both."""
+    listed = {"train": ["s4"], "val": ["s5"]}
+    for split, expected in ((None, {"train": ["s1", "s2"], "val": ["s3"]}), (listed, listed)):
+        assert split_names(folders / "both", NAMES, split, 0.2, 0) == expected
+
+
+@pytest.mark.parametrize(
+    ("split", "line"),
+    [
+        ("one", r"split_val\.txt: expected one id a line; found no such file"),
+        ("twice", "expected disjoint train and val; found 's2' in both"),
+        ("none", r"none: expected a folder with split_train\.txt .*; found no such"),
+        ({"train": ["s4"], "val": ["zz"]}, r"expected ids of scans in .*; found 'zz' in val"),
+        ({"train": ["s0-s2"], "val": ["s2"]}, r"data\.split: expected disjoint .* found 's2' in both"),
+        ({"train": ["s0"]}, r"data\.split: expected a list 'val'"),
+    ],
+)
+def test_bad_splits_are_refused(folders, split, line):
+    split = str(folders / split) if isinstance(split, str) else split
+    refused(line, lambda: split_names(folders, NAMES, split, 0.2, 0))
+
+
+def test_ranges_of_ids():
+    """Ranges select among the ids that exist."""
+    names = [f"{i:04d}" for i in range(0, 526, 25)]
+    split = read_split({"train": ["0000-0425"], "val": ["0426-0525"]}, names)
+    assert (len(split["train"]), len(split["val"])) == (18, 4)
+
+
+@pytest.mark.parametrize(
+    ("count", "fraction", "measured"), [(1, 0.1, 1), (2, 0.1, 1), (4, 0.1, 1), (4, 0.0, 0), (2, 1, 2)]
+)
+def test_few_scans_leave_somebody_to_validate(tmp_path, count, fraction, measured):
+    """A tenth of four scans is one; all can be measured, or none."""
+    names = [f"s{i}" for i in range(count)]
+    drawn = split_names(tmp_path, names, None, fraction, 0)
+    assert len(drawn["val"]) == measured
+    assert sorted(drawn["train"] + drawn["val"]) == names
+
+
+MANY = float("inf")
+
+
+@pytest.mark.parametrize(
+    ("count", "processes", "on_gpu", "cores", "expected"),
+    [
+        (MANY, 1, False, 2, 0),
+        (MANY, 1, False, 64, 0),
+        (MANY, 1, True, 1, 1),
+        (MANY, 1, True, 2, 1),
+        (MANY, 1, True, 6, 5),
+        (MANY, 8, True, 16, 1),
+        (MANY, 8, True, 96, 8),
+        (20, 1, True, 96, 0),
+        (100, 1, True, 96, 8),
+    ],
+)
+def test_processes_by_cores_devices_and_batches(monkeypatch, count, processes, on_gpu, cores, expected):
+    """A GPU leaves the cores to loading, a CPU none;
+    a few batches come sooner than a process starts."""
+    monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "fork")
+    assert automatic_workers(count, processes, on_gpu, cores) == expected
+
+
+def test_processes_that_import_pytorch_first_start_for_more_batches(monkeypatch):
+    """As on macOS, where a start takes seconds."""
+    monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "spawn")
+    assert automatic_workers(100, 1, True, 96) == 0
+    assert automatic_workers(1000, 1, True, 96) == 8
+
+
+def test_automatic_processes_are_said_once_and_load_the_same(boxes, caplog):
+    """Evaluation with its few batches starts none and says nothing."""
+    with caplog.at_level(logging.INFO):
+        data = rendered(boxes, workers="auto", steps_per_epoch=3)
+        loader = data.train_dataloader()
+        assert loader.num_workers == automatic_workers(MANY, 1, False)
+        assert data.val_dataloader().num_workers == 0
+    assert sum("data.workers=auto" in record.message for record in caplog.records) == 1
+    expected = rendered(boxes, workers=0, steps_per_epoch=3).train_dataloader()
+    assert all(map(equal, loader, expected))
+
+
+def test_batches_can_be_sent_to_processes_that_begin_anew(boxes):
+    """All that a spawned process receives, as on macOS."""
+    batches = rendered(boxes, augmentation={"gamma": 0.1}).train_dataloader().dataset
+    batches[0]
+    assert equal(pickle.loads(pickle.dumps(batches))[1], batches[1])
+
+
+_TRAINING = """
+import sys
+from tests.helpers.people import rendered
+batches = iter(rendered(sys.argv[1], workers=2, steps_per_epoch=10**6).train_dataloader())
+next(batches)
+try:
+    print(*[process.pid for process in batches._workers], flush=True)
+    while True:
+        next(batches)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+class Signalled:
+    """Batches, whose process gets the signal of an announced end with each."""
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, index):
+        os.kill(os.getpid(), signal.SIGUSR2)
+        return index
+
+
+def test_an_announced_end_leaves_loading_to_the_training():
+    """SLURM sends the signal to all processes of a job; a worker ended, and with it the training."""
+    assert list(loader_of(Signalled(), 1)) == [0, 1, 2]
+
+
+def test_an_interrupt_ends_all_processes_without_their_traces(boxes):
+    """A terminal sends Ctrl-C to all of them; only the one that trains answers."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", _TRAINING, str(boxes)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        cwd=Path(__file__).parents[2],
+    )
+    children = [int(number) for number in process.stdout.readline().split()]
+    assert len(children) == 2
+    os.killpg(process.pid, signal.SIGINT)
+    said, errors = process.communicate(timeout=60)
+    assert (said.strip(), process.returncode) == ("interrupted", 0)
+    assert "KeyboardInterrupt" not in errors
+    deadline = time.monotonic() + 20
+    while any(map(is_running, children)):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True

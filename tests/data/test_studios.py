@@ -1,21 +1,28 @@
-"""ZJU-MoCap: every oddity of the format, on a miniature in its true layout."""
+"""ZJU-MoCap and HuMMan-Recon: every oddity of their formats, on miniatures in their true layouts."""
 
+import pickle
 import shutil
+import sys
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import sparse
 
+from ghgs_lit.data.humman import HuMMan
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.smpl import read_model
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.data.zju_mocap import ZJUMoCap, frame_number, read_annotations
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
+from scripts.miniatures.smpl import stand_in
 from tests.helpers.captures import (
     build_data,
     inside,
+    require_same_packed,
 )
 
 OPENCV = np.load(Path(__file__).parents[1] / "fixtures" / "opencv_camera.npz")
@@ -23,7 +30,7 @@ SIZE = 112
 BOTH = ("mask_cihp", "mask")
 
 
-def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> Photographs:
+def of_zju(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> Photographs:
     split = {key: [{"sequences": [sequence], "frames": list(frames)}] for key in ("train", "val")}
     return Photographs(ZJUMoCap(root=root, split=split, **options).reader("val"), size)
 
@@ -31,7 +38,7 @@ def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, 
 def test_bodies_project_into_every_mask(zju_root):
     """Cameras, bodies and masks of both generations agree, after undistortion."""
     for sequence in ("386", "313"):
-        data = photographs(zju_root, sequence, cameras=None, masks=BOTH)
+        data = of_zju(zju_root, sequence, cameras=None, masks=BOTH)
         shares = [inside(data.view(n, k), data.body(n)) for n, ks in data.reader.subjects.items() for k in ks]
         assert len(shares) == 2 * (21 if sequence == "313" else 23)
         assert min(shares) > 0.99
@@ -45,16 +52,14 @@ def test_any_label_is_the_performer(zju_root, camera, mode):
     labels = np.asarray(image).reshape(SIZE, SIZE, -1)[..., 0]
     assert image.mode == mode
     assert 0 < labels.max() < 20
-    mask = photographs(zju_root, undistorted=False).view("CoreView_386_000000", camera).mask
+    mask = of_zju(zju_root, undistorted=False).view("CoreView_386_000000", camera).mask
     np.testing.assert_array_equal(mask, labels > 0)
 
 
 def test_masks_are_united(zju_root):
     """Several folders of masks give their union."""
-    parts = [
-        photographs(zju_root, undistorted=False, masks=[m]).view("CoreView_386_000000", 5).mask for m in BOTH
-    ]
-    union = photographs(zju_root, undistorted=False, masks=BOTH).view("CoreView_386_000000", 5).mask
+    parts = [of_zju(zju_root, undistorted=False, masks=[m]).view("CoreView_386_000000", 5).mask for m in BOTH]
+    union = of_zju(zju_root, undistorted=False, masks=BOTH).view("CoreView_386_000000", 5).mask
     np.testing.assert_array_equal(union, parts[0] | parts[1])
     assert union.sum() > max(part.sum() for part in parts)
 
@@ -63,8 +68,8 @@ def test_a_sequence_without_the_second_folder_of_masks_is_read(zju_root, tmp_pat
     """A missing second folder of masks is not an error."""
     shutil.copytree(zju_root / "CoreView_386", tmp_path / "CoreView_386")
     shutil.rmtree(tmp_path / "CoreView_386" / "mask")
-    one = photographs(tmp_path, masks=BOTH).view("CoreView_386_000000", 0).mask
-    np.testing.assert_array_equal(one, photographs(zju_root).view("CoreView_386_000000", 0).mask)
+    one = of_zju(tmp_path, masks=BOTH).view("CoreView_386_000000", 0).mask
+    np.testing.assert_array_equal(one, of_zju(zju_root).view("CoreView_386_000000", 0).mask)
 
 
 def test_undistortion_is_that_of_opencv():
@@ -82,19 +87,19 @@ def test_undistortion_is_that_of_opencv():
 
 def test_cameras_are_the_first_so_many(zju_root):
     """data.cameras selects the first cameras of a sequence."""
-    assert photographs(zju_root).reader.subjects["CoreView_386_000000"] == tuple(range(20))
-    assert len(photographs(zju_root, cameras=None).reader.subjects["CoreView_386_000000"]) == 23
-    assert len(photographs(zju_root, "313", cameras=None).reader.subjects["CoreView_313_000001"]) == 21
+    assert of_zju(zju_root).reader.subjects["CoreView_386_000000"] == tuple(range(20))
+    assert len(of_zju(zju_root, cameras=None).reader.subjects["CoreView_386_000000"]) == 23
+    assert len(of_zju(zju_root, "313", cameras=None).reader.subjects["CoreView_313_000001"]) == 21
 
 
 def test_old_sequences_count_frames_from_one(zju_root):
     """313 and 315 number their frames from 1, and have 21 cameras."""
-    data = photographs(zju_root, "313")
+    data = of_zju(zju_root, "313")
     assert list(data.reader.subjects) == ["CoreView_313_000001", "CoreView_313_000002"]
     assert not (zju_root / "CoreView_313" / "new_vertices" / "0.npy").exists()
     stored = np.load(zju_root / "CoreView_313" / "new_vertices" / "1.npy")
     np.testing.assert_array_equal(data.body("CoreView_313_000001"), stored)
-    assert list(photographs(zju_root).reader.subjects) == ["CoreView_386_000000", "CoreView_386_000001"]
+    assert list(of_zju(zju_root).reader.subjects) == ["CoreView_386_000000", "CoreView_386_000001"]
 
 
 @pytest.mark.parametrize("renamed", ["photographs", "masks", "both"])
@@ -106,7 +111,7 @@ def test_old_sequences_are_read_with_long_and_short_names(zju_root, tmp_path, re
     for pattern in patterns.get(renamed, [*patterns["photographs"], *patterns["masks"]]):
         for path in (tmp_path / "CoreView_313").glob(pattern):
             path.rename(path.with_name(path.stem.split("_")[4] + path.suffix))
-    one, other = (photographs(place, "313").view("CoreView_313_000002", 19) for place in (zju_root, tmp_path))
+    one, other = (of_zju(place, "313").view("CoreView_313_000002", 19) for place in (zju_root, tmp_path))
     np.testing.assert_array_equal(one.image, other.image)
     np.testing.assert_array_equal(one.mask, other.mask)
 
@@ -133,7 +138,7 @@ def test_names_of_windows_are_read(zju_root, tmp_path):
     for frame in content["ims"]:
         frame["ims"] = [name.replace("/", "\\") for name in frame["ims"]]
     np.save(folder / "annots.npy", content)
-    assert photographs(tmp_path).view("CoreView_386_000000", 0).mask.any()
+    assert of_zju(tmp_path).view("CoreView_386_000000", 0).mask.any()
 
 
 @pytest.mark.parametrize("shape", [(4,), (5,), (5, 1), (1, 5)])
@@ -155,19 +160,19 @@ def test_the_new_fit_is_preferred(zju_root, tmp_path):
     old = np.load(zju_root / "CoreView_386" / "vertices" / "0.npy")
     assert new.shape == (6890, 3)
     assert np.abs(new - old).max() > 0.002
-    np.testing.assert_array_equal(photographs(zju_root).body("CoreView_386_000000"), new)
+    np.testing.assert_array_equal(of_zju(zju_root).body("CoreView_386_000000"), new)
     shutil.rmtree(tmp_path / "CoreView_386" / "new_vertices")
-    np.testing.assert_array_equal(photographs(tmp_path).body("CoreView_386_000000"), old)
+    np.testing.assert_array_equal(of_zju(tmp_path).body("CoreView_386_000000"), old)
     shutil.rmtree(tmp_path / "CoreView_386" / "vertices")
-    assert photographs(tmp_path).body("CoreView_386_000000") is None
+    assert of_zju(tmp_path).body("CoreView_386_000000") is None
 
 
 def test_frames_are_places_in_the_annotations(zju_root):
     """Frames are indices, not frame numbers; an impossible start is refused."""
-    assert list(photographs(zju_root, frames=(1, 500, 5)).reader.subjects) == ["CoreView_386_000001"]
-    assert list(photographs(zju_root, frames=(0, 500, 5)).reader.subjects) == ["CoreView_386_000000"]
+    assert list(of_zju(zju_root, frames=(1, 500, 5)).reader.subjects) == ["CoreView_386_000001"]
+    assert list(of_zju(zju_root, frames=(0, 500, 5)).reader.subjects) == ["CoreView_386_000000"]
     with pytest.raises(InputError, match="expected a frame 700; found 2 frames"):
-        photographs(zju_root, frames=(700, 1000, 6))
+        of_zju(zju_root, frames=(700, 1000, 6))
 
 
 def test_the_default_split_is_sherfs(zju_root):
@@ -214,11 +219,148 @@ def test_photographs_are_undistorted_about_their_own_pixel_centers(zju_root):
     """Calibrations count centres from integers;
     half a pixel would bend the photograph elsewhere."""
     cameras, frames = read_annotations(zju_root / "CoreView_386" / "annots.npy")
-    bent = photographs(zju_root, undistorted=False).view("CoreView_386_000000", 7)
+    bent = of_zju(zju_root, undistorted=False).view("CoreView_386_000000", 7)
     path = zju_root / "CoreView_386" / frames[0][7]
     image = np.asarray(Image.open(path).convert("RGB"))
     lens = half_centers(cameras[7].intrinsics), cameras[7].distortion
     straight, matte = undistort(image, bent.mask * np.uint8(255), undistorting_grid(*lens, *image.shape[:2]))
-    view = photographs(zju_root).view("CoreView_386_000000", 7)
+    view = of_zju(zju_root).view("CoreView_386_000000", 7)
     np.testing.assert_array_equal(view.mask, matte > 127)
     np.testing.assert_array_equal(view.image, np.where(view.mask[..., None], straight, 0))
+
+
+HUMMAN = "p000455_a000986"
+WIDTH, HEIGHT = 160, 90
+
+
+def of_humman(root: Path, size=None, **options) -> Photographs:
+    data = HuMMan(root=root, split={"val": [HUMMAN]}, frames=(0, 97, 6), **options)
+    return Photographs(data.reader("val"), size)
+
+
+def test_frames_are_multiples_of_6_and_some_lack(humman_root):
+    """Frames that a sequence lacks are left out; all ten cameras are positions."""
+    assert list(of_humman(humman_root).reader.subjects) == [f"{HUMMAN}_{n:06d}" for n in (0, 6, 18)]
+    assert set(of_humman(humman_root).reader.subjects.values()) == {tuple(range(10))}
+
+
+def test_a_camera_that_lacks_a_frame_is_left_out(humman_root, tmp_path):
+    """A missing photograph removes one camera from one frame, not the frame."""
+    shutil.copytree(humman_root / HUMMAN, tmp_path / HUMMAN)
+    (tmp_path / HUMMAN / "kinect_color" / "kinect_004" / "000006.png").unlink()
+    subjects = of_humman(tmp_path).reader.subjects
+    assert subjects[f"{HUMMAN}_000006"] == (0, 1, 2, 3, 5, 6, 7, 8, 9)
+    assert subjects[f"{HUMMAN}_000018"] == tuple(range(10))
+
+
+def test_named_sequences_are_for_testing_and_the_rest_for_training(humman_root, tmp_path):
+    """The official test sequences never reach training."""
+    shutil.copytree(humman_root, tmp_path / "recon")
+    (tmp_path / "recon" / "notes").mkdir()
+    data = build_data("humman", tmp_path / "recon").dataset
+    assert len(data.split.val) == len(set(data.split.val)) == 22
+    assert data.sequences("train") == ["p100001_a000048"]
+    assert {frame.folder.name for frame in data.reader("val").frames.values()} == {HUMMAN}
+    assert data.published == {"train": 317, "val": 22}
+    assert list(range(*data.frames)) == [6 * i for i in range(17)]
+
+
+def test_any_value_of_the_matting_is_the_performer(humman_root):
+    """Soft values of the matting count as the performer, too."""
+    path = humman_root / HUMMAN / "kinect_mask" / "kinect_002" / "000006.png"
+    matting = np.asarray(Image.open(path))
+    assert ((matting > 0) & (matting < 128)).any()
+    np.testing.assert_array_equal(of_humman(humman_root).view(f"{HUMMAN}_000006", 2).mask, matting > 0)
+
+
+def test_drawn_masks_are_read_where_there_are_any(humman_root):
+    """The option data.masks selects another folder, which only test sequences have."""
+    view = of_humman(humman_root, masks="kinect_mask_manual").view(f"{HUMMAN}_000006", 2)
+    assert view.mask.sum() < of_humman(humman_root).view(f"{HUMMAN}_000006", 2).mask.sum()
+    assert not (humman_root / "p100001_a000048" / "kinect_mask_manual").exists()
+
+
+def test_no_body_is_a_choice(humman_root):
+    """Without a body a batch says so, and training without Chamfer loss is possible."""
+    assert of_humman(humman_root).body(f"{HUMMAN}_000000") is None
+    batch = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0").training_batch(0)
+    assert batch.body_vertices is None
+    assert batch.images.shape == (1, 4, 3, 36, 64)
+
+
+def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(humman_root):
+    """The documented protocol: inputs 0 3 6 and seven targets; frames are not people."""
+    data = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0")
+    samples = list(data.evaluation_loader(views=3))
+    assert len(samples) == 3
+    assert samples[0].views == (("000/0", "003/0", "006/0"),)
+    targets, others = samples[0].targets, (1, 2, 4, 5, 7, 8, 9)
+    assert targets.names == (tuple(f"{k:03}/0" for k in others),)
+    views = [of_humman(humman_root, size=(36, 64)).view(f"{HUMMAN}_000000", k) for k in others]
+    images = (255 * targets.images[0].movedim(1, -1)).round()
+    np.testing.assert_array_equal(images, [view.image for view in views])
+    np.testing.assert_array_equal(targets.cameras.extrinsics[0], [view.extrinsics for view in views])
+    assert data.dataset.reader("val").people == 1
+
+
+def test_smpl_vertices_project_into_every_mask(humman_root):
+    """Model, parameters and cameras agree about where the body is."""
+    pytest.importorskip("smplx")
+    data = of_humman(humman_root, smpl_model=humman_root.with_name("recon_body_models"))
+    for name in data.reader.subjects:
+        assert data.body(name).shape == (6890, 3)
+        assert min(inside(data.view(name, k), data.body(name)) for k in range(10)) > 0.97
+
+
+def test_smpl_turns_about_the_pelvis_and_then_shifts(humman_root):
+    """The order of rotation and translation is SMPL's."""
+    pytest.importorskip("smplx")
+    from ghgs_lit.data.smpl import Body
+
+    body, model = Body(humman_root.with_name("recon_body_models")), stand_in()
+    still = {
+        "betas": np.zeros(10),
+        "body_pose": np.zeros(69),
+        "global_orient": np.zeros(3),
+        "transl": np.zeros(3),
+    }
+    rest = body.vertices(still)
+    np.testing.assert_allclose(rest, model["v_template"], atol=1e-5)
+    turned = body.vertices(
+        {**still, "global_orient": np.array([0, np.pi, 0]), "transl": np.array([1.0, 2, 3])}
+    )
+    pelvis = model["J_regressor"][0] @ model["v_template"]
+    np.testing.assert_allclose(turned, (rest - pelvis) * [-1, 1, -1] + pelvis + [1, 2, 3], atol=1e-5)
+
+
+class Ch:
+    """As chumpy's arrays are pickled: an object with its array under ``x``."""
+
+    def __init__(self, x):
+        self.x = x
+
+
+@pytest.mark.parametrize("protocol", [0, 2])
+def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monkeypatch, protocol):
+    """Users of the official file need no package that no longer installs."""
+    module = type(sys)("chumpy.ch")
+    module.Ch, Ch.__module__, Ch.__qualname__ = Ch, "chumpy.ch", "Ch"
+    monkeypatch.setitem(sys.modules, "chumpy", type(sys)("chumpy"))
+    monkeypatch.setitem(sys.modules, "chumpy.ch", module)
+    arrays = stand_in()
+    content = {
+        **arrays,
+        "shapedirs": Ch(arrays["shapedirs"]),
+        "J_regressor": sparse.csc_matrix(arrays["J_regressor"]),
+        "bs_type": "lrotmin",
+    }
+    path = tmp_path / "SMPL_NEUTRAL.pkl"
+    path.write_bytes(pickle.dumps(content, protocol=protocol))
+    monkeypatch.delitem(sys.modules, "chumpy.ch")
+    read = read_model(path)
+    for key, value in arrays.items():
+        np.testing.assert_allclose(read[key], value)
+
+
+def test_packed_frames_are_the_same(humman_root, tmp_path):
+    require_same_packed(of_humman(humman_root).reader, tmp_path, (36, 64))
