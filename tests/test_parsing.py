@@ -14,7 +14,7 @@ from ghgs_lit.data.images import read_image
 from ghgs_lit.data.layout import Completeness
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.runs import read_others, read_sweep
+from ghgs_lit.evaluation.tables import read_others, read_sweep
 from ghgs_lit.parsing import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory

@@ -1,4 +1,4 @@
-"""Runs, and results of other methods, as one frame: row of the table, setting, and metrics by subject.
+"""Runs as one frame: row of the table, setting, and metrics of each subject.
 
 A run is identified by its configuration, never by the name of its directory.
 """
@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import (
@@ -29,7 +29,7 @@ from ghgs_lit.config.keys import (
     switches_of,
 )
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import read_json, read_yaml
+from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import METHOD, read_results, validated
 from ghgs_lit.runs.run import runs_in_order
@@ -412,65 +412,3 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
             )
     order = list(dict.fromkeys(variants[path] for path in paths if path in variants))
     return Sweep(pd.concat(frames, ignore_index=True), planned, models, order)
-
-
-_Text = Annotated[str, Field(min_length=1)]
-_Count = Annotated[int, Field(ge=1)]
-
-
-class _Exact(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-
-class _Row(_Exact):
-    data: _Text
-    split: _Text
-    targets: _Text
-    protocol: _Text
-    views: _Count
-    seed: int = 0
-    subject: _Text | None = None
-    subjects: _Count | None = None
-    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
-
-
-class _Others(_Exact):
-    """Another method's file, which ``docs/tables.md`` describes."""
-
-    format: Literal["ghgs_lit.others"]
-    format_version: Literal[1]
-    method: _Text
-    source: _Text
-    rows: Annotated[list[_Row], Field(min_length=1)]
-
-
-def read_others(path: Path) -> pd.DataFrame:
-    """Rows of another method's results file, like those of :class:`Sweep`.
-
-    Args:
-        path: JSON file of the format above.
-
-    Returns:
-        Rows; ``origin`` is the file's ``source``; means have no ``subject`` and may have a
-        ``count`` of subjects.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        InputError: It does not have the format; the message names the key.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
-    others = validated(_Others, read_json(path), path.name)
-    rows = pd.DataFrame([row.model_dump() for row in others.rows])
-    cell = [*SETTING, "views", "seed"]
-    repeated = rows.duplicated([*cell, "subject"])
-    if repeated.any():
-        at = f"{path.name}.rows[{repeated.idxmax()}]"
-        raise InputError(f"{at}: expected each subject once a setting; found one again")
-    means = rows["subject"].isna()
-    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
-        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
-    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
-    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
-    variant = Variant("other", others.method)
-    return rows.assign(variant=variant, source=str(path), run=None, origin=others.source).join(metrics)
