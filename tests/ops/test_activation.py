@@ -1,8 +1,6 @@
-"""Kernels of the activations of Gaussians against plain PyTorch: those of a CPU in float32, of a GPU in
-float64."""
+"""Kernels of the activations of Gaussians, of a CPU and of a GPU, against plain PyTorch in float64."""
 
 import dataclasses
-from contextlib import nullcontext
 
 import pytest
 import torch
@@ -10,9 +8,8 @@ import torch
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.method.heads.attributes import RawGaussians
-from ghgs_lit.ops.activation import cpu
 from ghgs_lit.types import DepthMaps, Points, map_tensors
-from tests.helpers.kernels import DEVICE, kernels, plain_pytorch
+from tests.helpers.kernels import DEVICE, WHERE, kernels
 from tests.helpers.scenes import make_batch, with_soft_rims
 from tests.method.heads.test_gaussian import make_head
 
@@ -34,43 +31,6 @@ def scene(b, v, height, width, scale=1.0, color=True):
     maps = DepthMaps(depth, valid, torch.ones_like(depth))
     nowhere = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.long)
     return raw, batch, Points(unproject_maps(depth, batch.cameras), valid, *nowhere), maps
-
-
-@torch.no_grad()
-def both(head, *inputs):
-    found = head.activate(*inputs)
-    with plain_pytorch():
-        return found, head.activate(*inputs)
-
-
-@pytest.mark.parametrize("axes", ["world", "surface"])
-@pytest.mark.parametrize(("b", "v", "height", "width"), [(2, 3, 42, 84), (1, 4, 56, 56)])
-@pytest.mark.parametrize("scale", [1.0, 30.0])
-@pytest.mark.parametrize("is_soft", [False, True])
-def test_the_kernel_gives_the_gaussians_of_plain_pytorch(axes, b, v, height, width, scale, is_soft):
-    raw, batch, points, maps = scene(b, v, height, width, scale, color=is_soft)
-    batch = batch if is_soft else dataclasses.replace(batch, alpha=None)
-    attributes = {"inward": 0.4, "thickness_start": 0.2}
-    limit = None if is_soft and scale == 1 else 0.05
-    colors = {"guide": True, "color_limit": 0.5 * is_soft}
-    head = make_head(axes=axes, attributes=attributes, offset_limit=limit, **colors)
-    found, expected = both(head, raw, batch, points, maps)
-    for name in FIELDS:
-        mine, own = getattr(found, name), getattr(expected, name)
-        # Axes of nearly level pixels are quotients of small differences of depths.
-        torch.testing.assert_close(
-            mine, own, atol=2e-5, rtol=2e-5, msg=lambda said, name=name: f"{name}: {said}"
-        )
-    assert found.splits == expected.splits
-    assert torch.equal(found.image, expected.image)
-
-
-def test_gradients_are_plain_pytorchs(monkeypatch):
-    raw, batch, points, maps = scene(1, 3, 42, 42)
-    monkeypatch.setattr(cpu, "activate", None)
-    raw = dataclasses.replace(raw, scale=raw.scale.requires_grad_())
-    make_head(axes="surface").activate(raw, batch, points, maps).scales.sum().backward()
-    assert raw.scale.grad.any()
 
 
 RAW = ("offset", "scale", "rotation", "opacity", "color")
@@ -107,13 +67,20 @@ def assert_as_exact_as_pytorch(head, *inputs):
     generator = torch.Generator().manual_seed(1)
     n = len(inputs[0].image)
     slopes = [torch.randn(n, *size, generator=generator) for size in ((3,), (4,), (3,), (), (3,))]
-    inputs = [to(x, DEVICE) for x in inputs]
-    plain = gaussians_and_gradients(head, *inputs, slopes)
-    exact = gaussians_and_gradients(head, *(to(x, torch.float64) for x in inputs), slopes)
+    with kernels("cpu") as called, torch.no_grad():
+        without = head.activate(*inputs)
+    assert called == ["activate"]
+    there = [to(x, DEVICE) for x in inputs]
+    with kernels("cpu") as called:
+        plain, slopes_of_plain = gaussians_and_gradients(head, *there, slopes)
+    assert called == []  # those of a CPU have no gradient
+    exact, exact_slopes = gaussians_and_gradients(head, *(to(x, torch.float64) for x in there), slopes)
     with kernels() as called:
-        found = gaussians_and_gradients(head, *inputs, slopes)
+        found, found_slopes = gaussians_and_gradients(head, *there, slopes)
     assert called == ["activate", "activate_back"]
-    for mine, own, true in zip(found, plain, exact, strict=True):
+    of_cpu = [getattr(without, name).to(DEVICE) for name in FIELDS]
+    compared = ((of_cpu, plain, exact), (found, plain, exact), (found_slopes, slopes_of_plain, exact_slopes))
+    for mine, own, true in compared:
         limits = [4 * error for error in errors(own, true)]
         for error, limit, x in zip(errors(mine, true), limits, true, strict=True):
             assert error <= limit + 4 * torch.finfo(torch.float32).eps * float(x.abs().max())
@@ -161,13 +128,13 @@ def strided(x):
     return torch.stack((x, torch.zeros_like(x)), -1)[..., 0]
 
 
-@pytest.mark.parametrize("kernels_of", [nullcontext, kernels], ids=["cpu", "cuda"])
+@pytest.mark.parametrize("kind", WHERE)
 @torch.no_grad()
-def test_strides_change_nothing_and_what_is_not_finite_no_other(kernels_of):
-    raw, batch, points, maps = (to(x, DEVICE) for x in scene(2, 3, 28, 42))
+def test_strides_change_nothing_and_what_is_not_finite_no_other(kind):
+    raw, batch, points, maps = (map_tensors(x, lambda x: x.to(WHERE[kind])) for x in scene(2, 3, 28, 42))
     head = make_head(axes="surface")
     raw = dataclasses.replace(raw, color=None)
-    with kernels_of():
+    with kernels(kind):
         expected = head.activate(raw, batch, points, maps)
         found = head.activate(*(map_tensors(x, strided) for x in (raw, batch, points, maps)))
         broken = raw.scale.clone()

@@ -68,24 +68,52 @@ def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype):
             assert error(found, q, k, v) < max(1.5 * error(pytorch(q, k, v), q, k, v), 2.0**-9)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_fewer_queries_than_keys_and_more(dtype):
-    """Queries and keys may differ in number, which uses the padding of both."""
+def parts(queries, keys, dtype):
     q, k, v = scene(1, 2, 300, 64, dtype)
-    for queries, keys in ((5, 300), (300, 7), (1, 1)):
-        args = q[:, :, :queries], k[:, :, :keys], v[:, :, :keys]
-        assert error(cpu.attend_heads(*args), *args) < (limit(*args) if dtype == torch.float32 else 1e-2)
+    return q[:, :, :queries], k[:, :, :keys], v[:, :, :keys]
 
 
-def test_scores_that_rise_and_fall_by_hundreds():
-    """A running maximum that changes in every block of keys, or only in the first,
-    loses no accuracy."""
+def rising(keys):
+    """Scores that rise and fall by hundreds: the running maximum changes in every block of keys, or only in
+    the first."""
     v = scene(1, 1, 5 * KEYS, 32, torch.float32)[2]
-    slope = torch.linspace(-300, 300, 5 * KEYS)[:, None]
-    q = torch.ones_like(v)
-    for keys in (slope, -slope, slope.sin() * 300):
-        args = q, keys.expand(-1, 32)[None, None] / 32**0.5, v
-        assert error(cpu.attend_heads(*args), *args) < limit(*args)
+    return torch.ones_like(v), keys(torch.linspace(-300, 300, 5 * KEYS)[:, None]).expand_as(v) / 32**0.5, v
+
+
+def of_types(of_scores, of_values):
+    q, k, v = scene(1, 2, 50, 32, torch.float32)
+    return q.to(of_scores), k.to(of_scores), v.to(of_values)
+
+
+def apart():
+    """Channels that are not contiguous."""
+    q, k, v = scene(1, 2, 50, 32, torch.float32)
+    return tuple(x.transpose(2, 3).contiguous().transpose(2, 3) for x in (q, k, v))
+
+
+INPUTS = {
+    **{
+        f"{queries} queries, {keys} keys, {dtype}": parts(queries, keys, dtype)
+        for queries, keys in ((5, 300), (300, 7), (1, 1))
+        for dtype in DTYPES
+    },
+    "rising": rising(lambda slope: slope),
+    "falling": rising(lambda slope: -slope),
+    "waves": rising(lambda slope: slope.sin() * 300),
+    "values in float32": of_types(torch.bfloat16, torch.float32),
+    "values in bfloat16": of_types(torch.float32, torch.bfloat16),
+    "apart": apart(),
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_inputs_of_any_kind(name):
+    """Numbers of queries and keys that differ, scores of any size, other types than that of the values, which
+    the result has, and strides."""
+    args = INPUTS[name]
+    found = cpu.attend_heads(*args)
+    assert found.dtype == args[2].dtype
+    assert error(found, *args) < (limit(*args) if found.dtype == torch.float32 else 1e-2)
 
 
 def test_weights_below_the_smallest_float_count_for_nothing():
@@ -108,26 +136,6 @@ def test_what_is_not_finite_reaches_the_same_values_as_in_pytorch(dtype, bad):
         found = cpu.attend_heads(q, k, v)
         assert torch.equal(found.isnan(), pytorch(q.float(), k.float(), v.float()).isnan())
         assert found[:, :, 0].isfinite().all()
-
-
-def test_types_may_differ_and_that_of_the_values_is_taken():
-    """Queries and keys in another dtype than the values are converted,
-    and the result is in theirs."""
-    q, k, v = scene(1, 2, 50, 32, torch.float32)
-    halves = [x.bfloat16() for x in (q, k)]
-    found = cpu.attend_heads(*halves, v)
-    assert found.dtype == torch.float32
-    assert error(found, *halves, v) < limit(*halves, v)
-    found = cpu.attend_heads(q, k, v.bfloat16())
-    assert found.dtype == torch.bfloat16
-    assert error(found, q, k, v.bfloat16()) < 1e-2
-
-
-def test_inputs_whose_numbers_lie_apart():
-    """Inputs whose channels are not contiguous are copied, not misread."""
-    q, k, v = (x.transpose(2, 3).contiguous().transpose(2, 3) for x in scene(1, 2, 50, 32, torch.float32))
-    assert q.stride(-1) != 1
-    assert error(cpu.attend_heads(q, k, v), q, k, v) < limit(q, k, v)
 
 
 def test_what_the_kernel_is_asked_for(monkeypatch):

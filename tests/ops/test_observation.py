@@ -1,5 +1,5 @@
-"""Kernels that compare Gaussians with photographs against plain PyTorch: those of a CPU in float32, of a GPU
-in float64."""
+"""Kernels that compare Gaussians with photographs, of a CPU and of a GPU, against plain PyTorch in
+float64."""
 
 import dataclasses
 
@@ -9,33 +9,9 @@ import torch
 from ghgs_lit.method.rounds.observation import observe
 from ghgs_lit.rendering import render
 from ghgs_lit.types import map_tensors
-from tests.helpers.kernels import DEVICE, kernels, plain_pytorch
+from tests.helpers.kernels import WHERE, kernels
 from tests.helpers.scenes import make_batch, with_soft_rims
 from tests.method.rounds.test_observation import splats
-
-
-def in_plain_pytorch(gaussians, batch):
-    with plain_pytorch():
-        return observe(gaussians, batch)
-
-
-@pytest.mark.parametrize(("b", "v", "height", "width"), [(2, 4, 42, 84), (1, 2, 56, 56), (3, 5, 70, 42)])
-@pytest.mark.parametrize("spread", [0.0, 0.3, 3.0])
-def test_the_kernel_sees_what_plain_pytorch_does(b, v, height, width, spread):
-    """Also at the border, outside of images and behind cameras; one image shows no subject."""
-    batch = with_soft_rims(make_batch(b, v, height, width))
-    batch.masks[-1, 0] = False
-    gaussians = splats(batch)
-    moved = torch.randn(gaussians.means.shape, generator=torch.Generator().manual_seed(1)) * spread
-    gaussians = dataclasses.replace(gaussians, means=gaussians.means + moved)
-    found, expected = observe(gaussians, batch), in_plain_pytorch(gaussians, batch)
-    # On the border rounding decides who is seen.
-    same = found[..., 9] == expected[..., 9]
-    assert same.float().mean() > 0.999
-    torch.testing.assert_close(found[same], expected[same], atol=2e-3, rtol=0)
-    assert (found - expected)[same].abs().mean() < 1e-5
-    assert (expected[..., 9] == 0).any() == (spread > 0.2)
-
 
 EPS = torch.finfo(torch.float32).eps
 
@@ -44,18 +20,20 @@ def in_float64(value):
     return map_tensors(value, lambda x: x.double() if x.is_floating_point() else x)
 
 
-def on_device(*values):
-    return [map_tensors(value, lambda x: x.to(DEVICE)) for value in values]
+def on_device(kind, *values):
+    return [map_tensors(value, lambda x: x.to(WHERE[kind])) for value in values]
 
 
+@pytest.mark.parametrize("kind", WHERE)
 @pytest.mark.parametrize(("b", "v", "height", "width"), [(2, 4, 28, 42), (1, 2, 56, 28), (3, 5, 42, 28)])
 @pytest.mark.parametrize("spread", [0.0, 0.3, 3.0])
 @pytest.mark.parametrize("is_soft", [False, True])
-def test_values_are_as_exact_as_plain_pytorchs(b, v, height, width, spread, is_soft):
-    """Elements with unequal numbers of Gaussians, or none;
-    Gaussians outside of frames and behind cameras."""
+def test_values_are_as_exact_as_plain_pytorchs(kind, b, v, height, width, spread, is_soft):
+    """Elements with unequal numbers of Gaussians, or none; Gaussians outside of frames and behind cameras; an
+    image without a subject."""
     batch = make_batch(b, v, height, width)
     batch = with_soft_rims(batch) if is_soft else batch
+    batch.masks[-1, 0] = False
     gaussians = splats(make_batch(b, v, height, width))
     noise = torch.randn(gaussians.means.shape, generator=torch.Generator().manual_seed(1))
     gaussians = dataclasses.replace(gaussians, means=gaussians.means + spread * noise)
@@ -64,15 +42,16 @@ def test_values_are_as_exact_as_plain_pytorchs(b, v, height, width, spread, is_s
         keep = torch.cat((torch.arange(7), first + torch.arange(sum(gaussians.splits[1:-1]))))
         gaussians = gaussians.select(keep, (7, *gaussians.splits[1:-1], 0))
     rendering = render(gaussians, batch.cameras)
-    gaussians, batch, rendering = on_device(gaussians, batch, rendering)
+    gaussians, batch, rendering = on_device(kind, gaussians, batch, rendering)
     exact = observe(*map(in_float64, (gaussians, batch, rendering)))
-    with kernels() as called:
+    with kernels(kind) as called:
         found = observe(gaussians, batch, rendering)
     assert called == ["observe"]
     # A pixel is a quotient of products, exact to some roundings of its size: colours differ by as
     # much of the largest difference of neighbouring pixels. A distance behind the surface is
     # divided by 5 cm.
     pixel = 8 * EPS * max(height, width)
+    assert (exact[..., 9] == 0).any() == (spread > 0.2)
     same = (found[..., 9] == exact[..., 9].float()).all(-1)
     assert same.float().mean() > 0.995  # rounding may move a point across a border
     difference = (found - exact).abs()[same]
@@ -82,15 +61,16 @@ def test_values_are_as_exact_as_plain_pytorchs(b, v, height, width, spread, is_s
     assert torch.equal(found[..., 10], exact[..., 10].float())
 
 
-def test_nothing_in_a_batch_of_none_and_what_is_not_finite_stays_where_it_is():
+@pytest.mark.parametrize("kind", WHERE)
+def test_nothing_in_a_batch_of_none_and_what_is_not_finite_stays_where_it_is(kind):
     batch = make_batch(2, 3, 28, 28)
     gaussians = splats(batch)
     rendering = render(gaussians, batch.cameras)
-    gaussians, batch, rendering = on_device(gaussians, batch, rendering)
+    gaussians, batch, rendering = on_device(kind, gaussians, batch, rendering)
     means, images = gaussians.means.clone(), batch.images.clone()
     means[4], images[1, 2] = torch.nan, torch.nan
     spoiled = dataclasses.replace(gaussians, means=means), dataclasses.replace(batch, images=images)
-    with kernels():
+    with kernels(kind):
         expected = observe(gaussians, batch, rendering)
         found = observe(*spoiled, rendering)
         none = observe(gaussians.select(slice(0, 0), (0, 0)), batch, rendering)

@@ -1,80 +1,90 @@
-"""Kernels of the rounds' memory against plain PyTorch in float64, on a CPU with gradients."""
-
-import functools
+"""Kernels of the rounds' memory, of a CPU and of a GPU, against plain PyTorch in float64; gradients of a
+CPU's."""
 
 import pytest
 import torch
 from torch import nn
 
 from ghgs_lit.geometry.precision import _float32
-from ghgs_lit.method.rounds import RoundsOptions
 from ghgs_lit.ops import pool
 from ghgs_lit.ops.dispatch import OPERATORS
-from ghgs_lit.ops.observation import CHANNELS
-from ghgs_lit.ops.round_memory import plain, remembered
-from tests.helpers.kernels import DEVICE, kernels
+from ghgs_lit.ops.round_memory import remembered
+from tests.helpers.kernels import DEVICE, WHERE, kernels
 
-#: What is known beside what views show, of ``depths=8``.
-KNOWN = 13
-
-
-def scene(hidden, views, count, seed=0):
-    """Rounds, and inputs of their network for ``count`` Gaussians."""
-    torch.manual_seed(seed)
-    rounds = RoundsOptions(hidden=hidden).build(16).eval()
-    return rounds, (
-        torch.randn(count, views, CHANNELS),
-        torch.randn(count, KNOWN),
-        torch.randn(count, hidden),
-    )
+#: Gaussians, views, channels of a view, width of the memory, and values that are known beside them.
+SIZES = [
+    (1111, 4, 11, 48, 13),
+    (33, 2, 11, 17, 13),
+    (1, 3, 11, 5, 13),
+    (65, 5, 3, 40, 40),
+    (32, 5, 11, 64, 24),
+]
 
 
-def fused(rounds, rows):
-    with torch.no_grad():
-        return remembered(rounds._layers, *rows)
+def scene(count, views, channels, hidden, known):
+    """Five layers, and their inputs: observations, what is known, and the memory before."""
+    torch.manual_seed(0)
+    sizes = ((channels, hidden), (hidden, hidden), (4 * hidden + known, 2 * hidden), (2 * hidden, hidden))
+    layers = nn.Sequential(*(nn.Linear(*size) for size in (*sizes, (hidden, hidden))))
+    rows = [torch.randn(count, *size) for size in ((views, channels), (known,), (hidden,))]
+    return layers, [*rows[:2], rows[2].tanh()]
 
 
-@pytest.mark.parametrize(("hidden", "views", "count"), [(48, 4, 1111), (17, 2, 33), (5, 3, 1), (64, 5, 32)])
-def test_the_kernel_remembers_what_plain_pytorch_does(hidden, views, count):
-    rounds, rows = scene(hidden, views, count)
-    expected = remembered(rounds.double()._layers, *(x.double() for x in rows))
-    found = fused(rounds.float(), rows)
+@torch.no_grad()
+def by_kernel(kind, layers, rows):
+    with kernels(kind) as called, _float32(WHERE[kind].type, True):
+        found = remembered(layers.to(WHERE[kind]), *(x.to(WHERE[kind]) for x in rows))
+    assert called == ["remember"]
+    return found.cpu()
+
+
+@pytest.mark.parametrize("kind", WHERE)
+@pytest.mark.parametrize("size", SIZES)
+@torch.no_grad()
+def test_the_kernel_remembers_what_plain_pytorch_does(kind, size):
+    """To the rounding of factors to TF32 on a GPU, and of float32 elsewhere."""
+    layers, rows = scene(*size)
+    expected = remembered(layers.double(), *(x.double() for x in rows))
+    found = by_kernel(kind, layers.float(), rows)
+    limit = {"cpu": 1e-6, "cuda": 2e-3 if DEVICE.type == "cuda" else 5e-6}[kind]
     assert expected.std() > 0.1
-    torch.testing.assert_close(found.double(), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.double(), expected, atol=limit, rtol=0)
 
 
-@pytest.mark.parametrize(("hidden", "views", "count"), [(48, 4, 2500), (17, 2, 33), (5, 3, 1), (64, 5, 32)])
-def test_gradients_are_those_of_plain_pytorch(hidden, views, count):
+@pytest.mark.parametrize("size", [(2500, 4, 11, 48, 13), *SIZES[1:]])
+def test_gradients_are_those_of_plain_pytorch(size):
     """Those of more Gaussians than one task has, of views that show the same,
     and of a single Gaussian."""
-    rounds, (each, known, before) = scene(hidden, views, count)
-    each[::3, 1] = each[::3, -1]  # two views without the Gaussian show the same
-    weights = torch.randn(count, hidden)
+    layers, rows = scene(*size)
+    rows[0][::3, 1] = rows[0][::3, -1]  # two views without the Gaussian show the same
+    weights = torch.randn(size[0], size[3])
 
-    def gradients(forward, dtype):
-        rounds.to(dtype)
-        rows = [x.to(dtype) for x in (each, known, before)]
-        layers = [p for part in (rounds.view, rounds.update, rounds.memory) for p in part.parameters()]
-        after = forward(*rows[:2], rows[2].requires_grad_())
-        return torch.autograd.grad((after * weights.to(dtype)).sum(), [rows[2], *layers])
+    def gradients(dtype):
+        layers.to(dtype)
+        each, known, before = (x.to(dtype) for x in rows)
+        after = remembered(layers, each, known, before.requires_grad_())
+        return torch.autograd.grad((after * weights.to(dtype)).sum(), [before, *layers.parameters()])
 
-    fused = functools.partial(remembered, rounds._layers)
-    found = gradients(fused, torch.float32)
-    for mine, expected in zip(found, gradients(fused, torch.float64), strict=True):
+    with kernels("cpu") as called:
+        found = gradients(torch.float32)
+    assert called == ["remember"]
+    for mine, expected in zip(found, gradients(torch.float64), strict=True):
         assert (mine - expected).norm() < 2e-6 * expected.norm()
 
 
 def test_other_gaussians_change_no_bit():
-    rounds, rows = scene(48, 4, 5000)
-    assert torch.equal(fused(rounds, [x[1000:1010] for x in rows]), fused(rounds, rows)[1000:1010])
+    layers, rows = scene(5000, 4, 11, 48, 13)
+    alone = by_kernel("cpu", layers, [x[1000:1010] for x in rows])
+    assert torch.equal(alone, by_kernel("cpu", layers, rows)[1000:1010])
 
 
+@pytest.mark.parametrize("kind", WHERE)
 @pytest.mark.parametrize("row", [0, 1, 2])
-def test_what_is_not_finite_reaches_no_other_gaussian(row):
-    rounds, rows = scene(48, 3, 40)
-    expected = fused(rounds, rows)
-    rows[row][7] = torch.nan
-    found = fused(rounds, rows)
+def test_what_is_not_finite_reaches_no_other_gaussian(kind, row):
+    layers, rows = scene(40, 3, 11, 48, 13)
+    expected = by_kernel(kind, layers, rows)
+    rows[row].view(40, -1)[7, -5] = torch.nan
+    found = by_kernel(kind, layers, rows)
     assert found[7].isnan().all()
     others = torch.arange(40) != 7
     assert torch.equal(found[others], expected[others])
@@ -92,48 +102,10 @@ def test_where_the_kernel_is_used(monkeypatch):
     assert not pool.multiplies(x)
 
 
-def rows_of(count, views, channels, hidden, more):
-    generator = torch.Generator().manual_seed(0)
-    sizes = ((count, views, channels), (count, more), (count, hidden))
-    each, known, memory = (torch.randn(size, generator=generator) for size in sizes)
-    return each, known, torch.tanh(memory)
-
-
-def layers_of(channels, hidden, more):
-    torch.manual_seed(1)
-    sizes = ((channels, hidden), (hidden, hidden), (4 * hidden + more, 2 * hidden), (2 * hidden, hidden))
-    return [nn.Linear(*size).to(DEVICE) for size in (*sizes, (hidden, hidden))]
-
-
-@pytest.mark.parametrize("size", [(70, 4, 11, 48, 24), (1, 2, 11, 16, 13), (65, 5, 3, 40, 40)])
-@torch.no_grad()
-def test_memory_is_that_of_plain_pytorch(size):
-    """To the rounding of factors to TF32 on a GPU, and of float32 in the interpreter."""
-    inputs = [value.to(DEVICE) for value in rows_of(*size)]
-    layers = layers_of(*size[2:])
-    weights = [tensor.double() for layer in layers for tensor in (layer.weight, layer.bias)]
-    wanted = plain(*(value.double() for value in inputs), weights)
-    with kernels() as called, _float32(DEVICE.type, True):
-        found = remembered(layers, *inputs)
-    assert called == ["remember"]
-    assert not found.isnan().any()
-    assert (found - wanted).abs().max() < (2e-3 if DEVICE.type == "cuda" else 5e-6)
-
-
-@torch.no_grad()
-def test_a_value_that_is_not_a_number_stays_in_its_row():
-    each, known, memory = rows_of(70, 4, 11, 48, 24)
-    each[3, 2, 5] = float("nan")
-    with kernels(), _float32(DEVICE.type, True):
-        found = remembered(layers_of(11, 48, 24), each.to(DEVICE), known.to(DEVICE), memory.to(DEVICE))
-    assert found[3].isnan().all()
-    assert found.isnan().any(1).sum() == 1
-
-
 @pytest.mark.parametrize("has_gradient", [False, True])
 @pytest.mark.parametrize("rounding", [False, True])
 def test_float32_and_gradients_are_plain_pytorchs(rounding, has_gradient):
-    """Where products may not round to TF32, and where a gradient is wanted."""
-    inputs = [value.to(DEVICE) for value in rows_of(3, 2, 11, 48, 24)]
+    """On a GPU where products may not round to TF32, and where a gradient is wanted."""
+    inputs = [x.to(DEVICE) for x in scene(3, 2, 11, 48, 24)[1]]
     with kernels(), torch.set_grad_enabled(has_gradient), _float32(DEVICE.type, rounding):
         assert OPERATORS["remember"].has_kernel(*inputs, []) == (rounding and not has_gradient)

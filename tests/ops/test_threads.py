@@ -37,10 +37,9 @@ def observed():
 
 
 def remembered_and_learned():
-    rounds, rows = test_round_memory.scene(48, 4, 5000)
-    after = remembered(rounds._layers, *rows)
-    layers = [rounds.view[0].weight, rounds.update[0].weight, rounds.memory.bias]
-    return [after, *torch.autograd.grad(after.square().sum(), layers)]
+    layers, rows = test_round_memory.scene(5000, 4, 11, 48, 13)
+    after = remembered(layers, *rows)
+    return [after, *torch.autograd.grad(after.square().sum(), list(layers.parameters()))]
 
 
 def swept():

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from contextlib import nullcontext
 
 import pytest
 import torch
@@ -14,7 +13,6 @@ from ghgs_lit.method.rounds.observation import SLOPES, looked_up, observe, slope
 from ghgs_lit.ops.observation import CHANNELS
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Gaussians
-from tests.helpers.kernels import plain_pytorch
 from tests.helpers.scenes import make_batch, with_soft_rims
 
 
@@ -119,16 +117,14 @@ def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
     assert between[0] > between[1]
 
 
-@pytest.mark.parametrize("kernel", [True, False])
-def test_errors_are_the_photograph_minus_the_render(kernel):
+def test_errors_are_the_photograph_minus_the_render():
     """Splats that are too dark have positive errors, those of their own pixel."""
     batch = make_batch(1, 3)
     dark = splats(batch)
     dark = dataclasses.replace(dark, colors=0.5 * dark.colors)
     error = batch.images - render(dark, batch.cameras).image
     expected = error.flatten(0, 1).flatten(2).mT[dark.image, dark.pixel]
-    with nullcontext() if kernel else plain_pytorch():
-        each = observe(dark, batch)
+    each = observe(dark, batch)
     assert expected.mean() > 0.05
     torch.testing.assert_close(each[:, 0, 3:6], expected, rtol=0, atol=1e-3)
     torch.testing.assert_close(each[:, 0, :3], dark.colors, rtol=0, atol=1e-3)
