@@ -17,13 +17,13 @@ from torch import Tensor
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Amount, Count, Options, Positive, Share
 from ghgs_lit.data.imperfections import (
-    backgrounds,
-    color_gains,
-    cut,
-    imperfect_mask,
-    miscalibrated,
-    tone_powers,
-    toned,
+    change_tones,
+    cut_subjects,
+    draw_backgrounds,
+    draw_color_gains,
+    draw_tone_powers,
+    perturb_cameras,
+    perturb_mask,
 )
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
@@ -163,34 +163,34 @@ class Augmentation(Options):
         """
         streams = [rng.spawn(6) for rng in rngs]
         if self.cut:
-            batch = cut(batch, self.cut, [s[4] for s in streams])
+            batch = cut_subjects(batch, self.cut, [s[4] for s in streams])
         images = batch.images
         masks = batch.masks
         cameras = batch.cameras
         alpha = batch.alpha
         if self.exposure or self.white_balance:
             views = masks.shape[1]
-            gains = [color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
+            gains = [draw_color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
             images = (images * torch.from_numpy(np.stack(gains)).to(images)[..., None, None]).clamp(0, 1)
         if self.gamma:
-            powers = np.stack([tone_powers(masks.shape[1], self.gamma, s[5]) for s in streams])
-            images = toned(images, alpha, torch.from_numpy(powers).to(images))
+            powers = np.stack([draw_tone_powers(masks.shape[1], self.gamma, s[5]) for s in streams])
+            images = change_tones(images, alpha, torch.from_numpy(powers).to(images))
         if self.calibration:
             wrong = [
-                miscalibrated(cameras[b], masks[b], self.calibration, s[1]) for b, s in enumerate(streams)
+                perturb_cameras(cameras[b], masks[b], self.calibration, s[1]) for b, s in enumerate(streams)
             ]
             matrices = zip(*((one.intrinsics, one.extrinsics) for one in wrong), strict=True)
             cameras = Cameras(*map(torch.stack, matrices), cameras.height, cameras.width)
         if any(self._of_masks):
             known = masks.to(images) if alpha is None else alpha
             segmented = [
-                self._segmented(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
+                self._segment(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
             ]
             images, masks, mattes = (torch.stack(parts) for parts in zip(*segmented, strict=True))
             alpha = None if alpha is None else mattes
         return dataclasses.replace(batch, images=images, masks=masks, cameras=cameras, alpha=alpha)
 
-    def _segmented(
+    def _segment(
         self,
         images: Float[Tensor, "V 3 h w"],
         masks: Bool[Tensor, "V h w"],
@@ -211,14 +211,12 @@ class Augmentation(Options):
             Images, masks and mattes of the same shapes.
         """
         limits = (self.mask_offset, self.mask_ragged, HOLE, self.mask_hole_chance)
-        wrong = torch.from_numpy(
-            np.stack([imperfect_mask(mask, *limits, outlines) for mask in masks.numpy()])
-        )
+        wrong = torch.from_numpy(np.stack([perturb_mask(mask, *limits, outlines) for mask in masks.numpy()]))
         has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)
         if not has_background:
             # Pixels that the segmentation adds are counted as a whole.
             return images * wrong[:, None], wrong, torch.where(wrong > masks, 1, mattes * wrong)
-        patterns = torch.from_numpy(backgrounds(*masks.shape, behind)).to(images)
+        patterns = torch.from_numpy(draw_backgrounds(*masks.shape, behind)).to(images)
         # Brightened colours may exceed their share of a pixel.
         photographs = (images + (1 - mattes[:, None]) * patterns).clamp(max=1)
         if not is_refined:

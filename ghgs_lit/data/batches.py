@@ -110,7 +110,7 @@ class StepSampler(DistributedSampler):
         return len(self.dataset)
 
 
-def automatic_workers(batches: float, processes: int, on_gpu: bool, cores: int | None = None) -> int:
+def choose_workers(batches: float, processes: int, on_gpu: bool, cores: int | None = None) -> int:
     """The number of loading processes of ``data.workers=auto``.
 
     None for a few batches, and none on a CPU: the model needs the cores itself, and a batch takes
@@ -134,7 +134,7 @@ def automatic_workers(batches: float, processes: int, on_gpu: bool, cores: int |
     return min(max(spare, 1), _MOST)
 
 
-def loader_of(batches: Dataset, workers: int, **options: Any) -> DataLoader:
+def make_loader(batches: Dataset, workers: int, **options: Any) -> DataLoader:
     """A loader whose items are whole batches.
 
     Args:
@@ -152,12 +152,12 @@ def loader_of(batches: Dataset, workers: int, **options: Any) -> DataLoader:
             num_workers=workers,
             persistent_workers=workers > 0,
             pin_memory=torch.cuda.is_available(),
-            worker_init_fn=_leave_interrupts,
+            worker_init_fn=_ignore_signals,
             **options,
         )
 
 
-def _leave_interrupts(number: int) -> None:
+def _ignore_signals(number: int) -> None:
     """Ctrl-C reaches every process of a terminal, and what SLURM sends before a job's end every one of
     the job; the one that trains ends the others."""
     for each in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):

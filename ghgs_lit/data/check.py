@@ -11,9 +11,16 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import Dataset
 
-from ghgs_lit.data.batches import loader_of
+from ghgs_lit.data.batches import make_loader
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.data.mask_checks import SEARCH, height, implausible, overlap, silhouette, twins
+from ghgs_lit.data.mask_checks import (
+    SEARCH,
+    implausible,
+    make_silhouette,
+    measure_height,
+    measure_overlap,
+    twins,
+)
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
 from ghgs_lit.errors import InputError
@@ -40,7 +47,7 @@ class Reading:
         place: the photograph in messages.
         problem: line on what is wrong.
         has_body: whether the subject has a body.
-        iou: of body and mask, in [0, 1] (:func:`overlap`); None: there is no body to compare.
+        iou: of body and mask, in [0, 1] (:func:`measure_overlap`); None: there is no body to compare.
         agreement: share of the mask that the other masks allow, where there is no body to compare.
         tall: the subject's largest side in world units, by body or masks.
         digest: of the photograph's pixels.
@@ -118,7 +125,7 @@ class _Readings(Dataset):
         if body is not None:
             reading.has_body = True
             reading.tall = float(np.ptp(body, axis=0).max())
-            reading.iou = overlap(body, view)
+            reading.iou = measure_overlap(body, view)
         problem = implausible(view.mask) if reading.iou is None else None
         if reading.iou is not None and reading.iou < self.min_iou:
             least = f"IoU of {self.min_iou:.2f} or more"
@@ -130,7 +137,7 @@ class _Readings(Dataset):
         if problem is not None:
             raise InputError(f"{place}: {problem}")
         if reading.iou is None:
-            reading.silhouette = silhouette(view)
+            reading.silhouette = make_silhouette(view)
 
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
@@ -161,8 +168,8 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
         readings[phase] = _read(reader, targets, min_iou, data, f"checking {phase}")
         _compare_masks(readings[phase], min_agreement)
         report.phases[phase] = _summarize(reader, readings[phase])
-        report.problems += reader.problems + _known(readings[phase], "problem")
-        report.notes += _notes(dataset.published.get(phase), phase, reader, readings[phase])
+        report.problems += reader.problems + _collect(readings[phase], "problem")
+        report.notes += _describe_oddities(dataset.published.get(phase), phase, reader, readings[phase])
     if len(readings) == len(PHASES):
         report.problems += _find_leaks(str(dataset.root), *readings.values())
     try:
@@ -190,7 +197,7 @@ def _read(
         return []
     photographs = Photographs(reader, None, min(data.dataset.cache_images_mb, _CACHE_MB))
     items = _Readings(photographs, listed, min_iou)
-    loader = loader_of(items, min(data.workers(len(items)), len(items)))
+    loader = make_loader(items, min(data.workers(len(items)), len(items)))
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 
 
@@ -212,7 +219,7 @@ def _compare_masks(readings: Sequence[Reading], least: float) -> None:
 
 def _compare_subject(readings: Sequence[Reading], least: float) -> None:
     silhouettes = [one.silhouette for one in readings]
-    tall = height(silhouettes)
+    tall = measure_height(silhouettes)
     for one, share in zip(readings, SEARCH.shares(silhouettes), strict=True):
         one.agreement = share
         one.tall = tall if one.tall is None else one.tall
@@ -224,7 +231,7 @@ def _compare_subject(readings: Sequence[Reading], least: float) -> None:
         )
 
 
-def _known(readings: Sequence[Reading], key: str) -> list:
+def _collect(readings: Sequence[Reading], key: str) -> list:
     """All known values of an attribute."""
     return [value for one in readings if (value := getattr(one, key)) is not None]
 
@@ -234,17 +241,19 @@ def _summarize(reader: Reader, readings: Sequence[Reading]) -> dict[str, float]:
         "people": reader.people,
         "subjects": len(reader.subjects),
         "photos": len(readings),
-        "broken": len(_known(readings, "problem")),
+        "broken": len(_collect(readings, "problem")),
         "bodies": len({one.name for one in readings if one.has_body}),
     }
     for key in ("iou", "agreement"):
-        if values := _known(readings, key):
+        if values := _collect(readings, key):
             figures[f"mean {key}"] = round(float(np.mean(values)), 3)
             figures[f"least {key}"] = round(min(values), 3)
     return figures
 
 
-def _notes(published: int | None, phase: str, reader: Reader, readings: Sequence[Reading]) -> list[str]:
+def _describe_oddities(
+    published: int | None, phase: str, reader: Reader, readings: Sequence[Reading]
+) -> list[str]:
     subjects = reader.subjects
     bodies = len({one.name for one in readings if one.has_body})
     notes = []
@@ -255,7 +264,7 @@ def _notes(published: int | None, phase: str, reader: Reader, readings: Sequence
             f"{phase}: expected a body for each of {len(subjects)} subjects; found "
             f"{bodies} (no Chamfer term; cameras are checked by their masks alone)"
         )
-    tall = np.median(_known(readings, "tall") or [0.0])
+    tall = np.median(_collect(readings, "tall") or [0.0])
     if tall > _TALLEST:
         notes.append(f"{phase}: expected metres; found subjects {tall:.0f} units tall (millimetres?)")
     most = max(map(len, subjects.values()), default=0)

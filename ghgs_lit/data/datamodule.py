@@ -15,10 +15,10 @@ from ghgs_lit.data.batches import (
     EvaluationBatches,
     StepSampler,
     TrainingBatches,
-    automatic_workers,
-    loader_of,
+    choose_workers,
+    make_loader,
 )
-from ghgs_lit.data.packed import Packs, folder_of
+from ghgs_lit.data.packed import Packs, choose_folder
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 Targets = TargetProtocol | Mapping[str, Any]
 
 
-def trained_batches(trainer: Trainer | None, length: int) -> int:
+def count_trained_batches(trainer: Trainer | None, length: int) -> int:
     """Number of batches that each process has trained on so far, also after a resume.
 
     Args:
@@ -54,7 +54,7 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
     return epochs * length + steps * trainer.accumulate_grad_batches
 
 
-def planned_batches(trainer: Trainer | None, length: int) -> float:
+def count_planned_batches(trainer: Trainer | None, length: int) -> float:
     """Number of batches that each process will train on; infinite where nothing limits it.
 
     Args:
@@ -69,7 +69,7 @@ def planned_batches(trainer: Trainer | None, length: int) -> float:
     return min(limits)
 
 
-def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
+def _read_protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
     several = targets if isinstance(targets, Sequence) and not isinstance(targets, str) else (targets,)
     return [read_node(protocol, "targets") for protocol in several]
 
@@ -157,7 +157,7 @@ class PhotographsDataModule(LightningDataModule):
             targets: choice of the targets; None: this module's.
         """
         data = self.dataset
-        protocols = (self.views, self._possible(targets or self.targets))
+        protocols = (self.views, self._check_static(targets or self.targets))
         numbers = (data.ring, data.batch_size, self.seed, data.class_steps)
         return TrainingSampler(self.subjects("train"), *protocols, *numbers)
 
@@ -199,7 +199,7 @@ class PhotographsDataModule(LightningDataModule):
         packs = {}
         for size in sizes:
             depths = self.trains_on_depths and size in (None, photographs.size)
-            options = (folder_of(data.folder), size, data.resampling, views, depths, writes)
+            options = (choose_folder(data.folder), size, data.resampling, views, depths, writes)
             packs[size] = Packs(photographs.reader, *options)
         announce = log.info if rank == 0 else log.debug
         photographs.packs = {size: each for size, each in packs.items() if each.fit(data.packed_gb, announce)}
@@ -213,14 +213,14 @@ class PhotographsDataModule(LightningDataModule):
         # Loading processes begin anew with each epoch,
         # for which a GPU would wait where subjects are few.
         length = self.dataset.steps_per_epoch or once * math.ceil(LEAST_STEPS / once)
-        planned = planned_batches(self.trainer, length)
+        planned = count_planned_batches(self.trainer, length)
         self._use_packs(planned, rank)
         batches = self.training_batches(length, rank, world)
         workers = self.workers(planned)
         if self.dataset.workers == "auto" and rank == 0:
             log.info("data.workers=auto: %d loading processes beside each that trains", workers)
-        steps = StepSampler(batches, lambda: trained_batches(self.trainer, length))
-        return loader_of(batches, workers, sampler=steps)
+        steps = StepSampler(batches, lambda: count_trained_batches(self.trainer, length))
+        return make_loader(batches, workers, sampler=steps)
 
     def evaluation_loader(
         self,
@@ -241,10 +241,10 @@ class PhotographsDataModule(LightningDataModule):
         Raises:
             InputError: the data has no such split, positions or views.
         """
-        protocols = _protocols(self.targets if targets is None else targets)
+        protocols = _read_protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.photographs(split), specs, batch_size or self.dataset.batch_size)
-        return loader_of(batches, self.workers(len(batches)))
+        return make_loader(batches, self.workers(len(batches)))
 
     def evaluation_batch(
         self,
@@ -261,7 +261,7 @@ class PhotographsDataModule(LightningDataModule):
             views: number of inputs; None: the view protocol's.
             targets: as for :meth:`evaluation_loader`, but None gives a batch without targets.
         """
-        protocols = [] if targets is None else _protocols(targets)
+        protocols = [] if targets is None else _read_protocols(targets)
         available = {subject: self.subjects(split)[subject]}
         return self.photographs(split).batch(self._evaluation_samples(available, protocols, views))
 
@@ -277,13 +277,13 @@ class PhotographsDataModule(LightningDataModule):
         """
         data = self.dataset
         count = self.views.evaluation_count if views is None else views
-        possible = [self._possible(protocol) for protocol in protocols]
+        possible = [self._check_static(protocol) for protocol in protocols]
         return evaluation_samples(subjects, count, possible, data.ring, self.seed, data.evaluation_positions)
 
     def val_dataloader(self) -> DataLoader:
         return self.evaluation_loader()
 
-    def _possible(self, targets: TargetProtocol) -> TargetProtocol:
+    def _check_static(self, targets: TargetProtocol) -> TargetProtocol:
         if self.dataset.static_cameras and targets.view_numbers != {RING_VIEW}:
             raise InputError(
                 f"targets: expected cameras for data={self.dataset.name}, as with targets=cameras "
@@ -292,7 +292,7 @@ class PhotographsDataModule(LightningDataModule):
         return targets
 
     def workers(self, batches: float) -> int:
-        """Number of loading processes, by :func:`automatic_workers` where ``data.workers``
+        """Number of loading processes, by :func:`choose_workers` where ``data.workers``
         does not say it.
 
         Args:
@@ -301,6 +301,6 @@ class PhotographsDataModule(LightningDataModule):
         if self.dataset.workers != "auto":
             return self.dataset.workers
         if self.trainer is None:
-            return automatic_workers(batches, 1, torch.cuda.is_available())
+            return choose_workers(batches, 1, torch.cuda.is_available())
         on_gpu = self.trainer.strategy.root_device.type != "cpu"
-        return automatic_workers(batches, self.trainer.num_devices, on_gpu)
+        return choose_workers(batches, self.trainer.num_devices, on_gpu)

@@ -10,7 +10,7 @@ import math
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import require
@@ -29,7 +29,7 @@ _PATCHES = ((3, 0.35), (12, 0.15), (40, 0.06))
 _NOISE = 0.02
 
 
-def color_gains(
+def draw_color_gains(
     views: int, exposure: float, white_balance: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3"]:
     """Random factors of stored colours, geometric mean 1 over cameras:
@@ -51,7 +51,7 @@ def color_gains(
     return 2 ** (np.stack((green + red, green, green + blue), -1) / _GAMMA)
 
 
-def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
+def draw_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
     """Random powers of stored colours, geometric mean 1 over cameras.
 
     Args:
@@ -64,7 +64,7 @@ def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.
     return np.exp(gamma * deviation / max(1, np.abs(deviation).max()))
 
 
-def toned(
+def change_tones(
     images: Float[Tensor, "B V 3 h w"], alpha: Float[Tensor, "B V h w"] | None, powers: Float[Tensor, "B V"]
 ) -> Float[Tensor, "B V 3 h w"]:
     """Raise the colours of each view to a power; multiplication by mattes is undone before.
@@ -81,7 +81,7 @@ def toned(
     return unmultiplied(images, shares) ** powers * shares
 
 
-def imperfect_mask(
+def perturb_mask(
     mask: Bool[np.ndarray, "h w"],
     offset: float,
     ragged: float,
@@ -115,7 +115,7 @@ def imperfect_mask(
         )
         part = mask[window]
         sides = [_BUMP * side for side in bumps.shape]
-        noise = _stretched(torch.from_numpy(bumps), *sides).numpy()
+        noise = _stretch(torch.from_numpy(bumps), *sides).numpy()
         noise = noise[: mask.shape[0], : mask.shape[1]][window]
         result[window] = signed_distance(part) + (2 * grow - 1) * offset + height * ragged * noise > 0
     if missing < hole_chance:
@@ -126,7 +126,7 @@ def imperfect_mask(
     return result if result.any() else mask
 
 
-def backgrounds(
+def draw_backgrounds(
     views: int, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3 h w"]:
     """Random background for each camera: cloudy patterns of large and small patches.
@@ -145,11 +145,11 @@ def backgrounds(
     colors = noise.float().mul_(_NOISE).add_(base.float())
     for cells, deviation in _PATCHES:
         patches = torch.from_numpy(rng.uniform(-deviation, deviation, (views, 3, cells, cells)))
-        colors += _stretched(patches.float(), height, width)
+        colors += _stretch(patches.float(), height, width)
     return colors.clamp_(0, 1).numpy()
 
 
-def _stretched(patches: Float[Tensor, "*batch m n"], height: int, width: int) -> Float[Tensor, "*batch h w"]:
+def _stretch(patches: Float[Tensor, "*batch m n"], height: int, width: int) -> Float[Tensor, "*batch h w"]:
     """Patches interpolated linearly, the middles of the outer ones at the middles of the
     outer pixels."""
     channels = patches.reshape(1, -1, *patches.shape[-2:])
@@ -157,7 +157,7 @@ def _stretched(patches: Float[Tensor, "*batch m n"], height: int, width: int) ->
     return pixels.reshape(*patches.shape[:-2], height, width)
 
 
-def miscalibrated(
+def perturb_cameras(
     cameras: Cameras, masks: Bool[Tensor, "V H W"], pixels: float, rng: np.random.Generator
 ) -> Cameras:
     """Cameras with errors: each is rotated, moved across its axis, and has another focal length.
@@ -201,12 +201,12 @@ def miscalibrated(
         lens[:, [0, 1], [0, 1]] *= 1 + errors[:, 5:] / half
         return lens, pose
 
-    points = unproject(corners, distances[:, None].expand(-1, 4), _of_each(lenses), _of_each(poses))
+    points = unproject(corners, distances[:, None].expand(-1, 4), _for_corners(lenses), _for_corners(poses))
 
     def seen(lens: Tensor, pose: Tensor) -> Tensor:
         """Pixels of the corners, which far from the world's origin differ from ``corners``
         by rounding."""
-        return project(points, _of_each(lens), _of_each(pose))[0]
+        return project(points, _for_corners(lens), _for_corners(pose))[0]
 
     def size(lens: Tensor, pose: Tensor) -> Tensor:
         return (seen(lens, pose) - seen(lenses, poses)).square().sum(-1).mean(-1).sqrt()
@@ -214,10 +214,10 @@ def miscalibrated(
     errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
     for _ in range(3):  # the size is nearly proportional to the errors
         errors = errors * (wanted / size(*moved(errors)))[:, None]
-    lens, pose = _apart(cameras, *moved(errors))
+    lens, pose = _remove_common_error(cameras, *moved(errors))
     largest = size(lens, pose).amax()
     if largest > pixels:
-        lens, pose = _apart(cameras, *moved(errors * (pixels / largest)))
+        lens, pose = _remove_common_error(cameras, *moved(errors * (pixels / largest)))
     return Cameras(lens.to(cameras.intrinsics), pose.to(cameras.extrinsics), cameras.height, cameras.width)
 
 
@@ -232,11 +232,11 @@ def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
     return torch.stack(corners).double()
 
 
-def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
+def _for_corners(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
     return matrices[:, None].expand(-1, 4, -1, -1)
 
 
-def _apart(
+def _remove_common_error(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
     """Intrinsics and extrinsics without the common part of their differences from true cameras.
@@ -260,7 +260,7 @@ def _apart(
 _SHOWN = 0.45, 0.95
 
 
-def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
+def cut_subjects(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
     """Cut a share of the subjects by the frame's lower edge.
 
     Half of them are cut in all inputs and targets at about the same height, so that no legs are
@@ -289,42 +289,37 @@ def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
             some = (chosen < 0.5) | (chosen == chosen.min())
             some[chosen.argmax()] = False  # at least one stays whole
             shares[b, some] = (low + (high - low) * heights)[some]
-    rows = _rows(batch.masks, shares)
-    maps = {name: _lowered(getattr(batch, name), rows) for name in ("images", "masks", "depths", "alpha")}
+    rows = _rows_down(batch.masks, shares)
+    maps = {name: _move_down(getattr(batch, name), rows) for name in ("images", "masks", "depths", "alpha")}
     targets = batch.targets
     if targets is not None:
-        lower = _rows(targets.masks, np.broadcast_to(ends[:, None], targets.masks.shape[:2]))
-        moved = {name: _lowered(getattr(targets, name), lower) for name in ("images", "masks")}
-        cameras = _with_lower_centers(targets.cameras, lower)
+        lower = _rows_down(targets.masks, np.broadcast_to(ends[:, None], targets.masks.shape[:2]))
+        moved = {name: _move_down(getattr(targets, name), lower) for name in ("images", "masks")}
+        cameras = _move_centers(targets.cameras, lower)
         targets = dataclasses.replace(targets, **moved, cameras=cameras)
-    return dataclasses.replace(
-        batch, **maps, cameras=_with_lower_centers(batch.cameras, rows), targets=targets
-    )
+    return dataclasses.replace(batch, **maps, cameras=_move_centers(batch.cameras, rows), targets=targets)
 
 
-def _rows(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> list[list[int]]:
+def _rows_down(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> Int[Tensor, "B V"]:
     """Rows by which photographs move down so that the given share of the mask's height remains."""
-    height = masks.shape[2]
-    views = masks.shape[1]
     moved = []
     for seen, share in zip(extents(masks.flatten(0, 1)), shares.flatten(), strict=True):
         end = math.ceil(seen.top + share * (seen.bottom - seen.top))
-        moved.append(height - end if seen.count and share < 1 else 0)
-    return [moved[start : start + views] for start in range(0, len(moved), views)]
+        moved.append(masks.shape[2] - end if seen.count and share < 1 else 0)
+    return torch.tensor(moved).reshape(shares.shape)
 
 
-def _lowered(maps: Tensor | None, rows: list[list[int]]) -> Tensor | None:
+def _move_down(maps: Tensor | None, rows: Int[Tensor, "B V"]) -> Tensor | None:
     """``maps`` [B, V, ..., H, W], each moved down by its rows, with zeros above."""
     if maps is None:
         return None
     moved = torch.zeros_like(maps)
-    for b, of_views in enumerate(rows):
-        for v, down in enumerate(of_views):
-            moved[b, v, ..., down:, :] = maps[b, v, ..., : maps.shape[-2] - down, :]
+    for old, new, down in zip(maps.flatten(0, 1), moved.flatten(0, 1), rows.flatten().tolist(), strict=True):
+        new[..., down:, :] = old[..., : maps.shape[-2] - down, :]
     return moved
 
 
-def _with_lower_centers(cameras: Cameras, rows: list[list[int]]) -> Cameras:
+def _move_centers(cameras: Cameras, rows: Int[Tensor, "B V"]) -> Cameras:
     intrinsics = cameras.intrinsics.clone()
-    intrinsics[..., 1, 2] += intrinsics.new_tensor(rows)
+    intrinsics[..., 1, 2] += rows.to(intrinsics)
     return dataclasses.replace(cameras, intrinsics=intrinsics)

@@ -23,7 +23,7 @@ _LEAST_VERTICES = 500
 _BODY_CELLS = 96
 
 
-def silhouette(view: View) -> Silhouette:
+def make_silhouette(view: View) -> Silhouette:
     """Coarse silhouette of a photograph, at most 64 cells high and wide.
 
     Args:
@@ -55,7 +55,7 @@ def implausible(mask: np.ndarray) -> str | None:
     return None
 
 
-def height(silhouettes: Sequence[Silhouette]) -> float:
+def measure_height(silhouettes: Sequence[Silhouette]) -> float:
     """Median height of the subject in world units.
 
     Args:
@@ -75,7 +75,7 @@ def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)
 
 
-def overlap(vertices: np.ndarray, view: View) -> float | None:
+def measure_overlap(vertices: np.ndarray, view: View) -> float | None:
     """IoU of the silhouette of a body and a mask.
 
     The silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts

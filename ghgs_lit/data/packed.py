@@ -98,10 +98,10 @@ class Packs:
         path = self.paths[name]
         if path is None:
             return None
-        pack = _opened(path)
+        pack = _try_open(path)
         if pack is None and self.writes:
             self._write(name, path)
-            pack = _opened(path)
+            pack = _try_open(path)
         if pack is None:  # nothing is written or looked for again
             self.paths[name] = None
         return pack
@@ -124,7 +124,7 @@ class Packs:
         for position, view in itertools.product(self.reader.subjects[name], self.views):
             with contextlib.suppress(InputError):  # raised when it is drawn
                 stored = self.reader.checked_view(name, position, view, self.depths)
-                content |= _packed(position, view, resize_view(stored, self.size, self.resampling))
+                content |= _pack_view(position, view, resize_view(stored, self.size, self.resampling))
         try:
             write_atomically(path, lambda temporary: temporary.write_bytes(save(content)))
             for other in self.folder.glob(f"{glob.escape(name)}-{self.digest}-*.safetensors"):
@@ -181,7 +181,7 @@ class Pack:
         return View(**arrays)
 
 
-def _packed(position: int, number: int, view: View) -> dict[str, np.ndarray]:
+def _pack_view(position: int, number: int, view: View) -> dict[str, np.ndarray]:
     """Arrays of a photograph by their names in the file."""
     maps = {name: array for name in _MAPS if (array := getattr(view, name)) is not None}
     shown = view.image.any(-1)
@@ -197,7 +197,7 @@ def _packed(position: int, number: int, view: View) -> dict[str, np.ndarray]:
     return {f"{position}/{number}/{name}": array for name, array in arrays.items()}
 
 
-def _opened(path: Path) -> Pack | None:
+def _try_open(path: Path) -> Pack | None:
     """The file at ``path`` if there is a whole one."""
     try:
         return _open(path)
@@ -212,7 +212,7 @@ def _digest(facts: list) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:12]
 
 
-def folder_of(data: Path) -> Path:
+def choose_folder(data: Path) -> Path:
     """Folder of the packed photographs of a data set.
 
     Args:

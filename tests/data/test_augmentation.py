@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.config import compose
 from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
-from ghgs_lit.data.imperfections import cut
+from ghgs_lit.data.imperfections import cut_subjects
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.types import Batch
@@ -246,7 +246,7 @@ def test_a_cut_moves_photographs_and_cameras_together(boxes):
     kinds = set()
     for seed in range(12):
         rngs = [np.random.default_rng([seed, b]) for b in range(2)]
-        batch = cut(clean, 1.0, rngs)
+        batch = cut_subjects(clean, 1.0, rngs)
         rows = batch.cameras.intrinsics[..., 1, 2] - clean.cameras.intrinsics[..., 1, 2]
         lower = batch.targets.cameras.intrinsics[..., 1, 2] - clean.targets.cameras.intrinsics[..., 1, 2]
         for name in ("images", "masks", "depths", "alpha"):
@@ -267,7 +267,7 @@ def test_a_cut_moves_photographs_and_cameras_together(boxes):
             assert (rows[b] > 0).any()
             assert everywhere or (left[b] == 1).any()
     assert kinds == {True, False}
-    assert equal(cut(clean, 0.0, [np.random.default_rng(b) for b in range(2)]), clean)
+    assert equal(cut_subjects(clean, 0.0, [np.random.default_rng(b) for b in range(2)]), clean)
 
 
 def test_imperfections_do_not_depend_on_batch_mates(boxes):

@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from ghgs_lit.data.batches import automatic_workers, loader_of
-from ghgs_lit.data.datamodule import trained_batches
+from ghgs_lit.data.batches import choose_workers, make_loader
+from ghgs_lit.data.datamodule import count_trained_batches
 from ghgs_lit.data.humman import HuMMan
 from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
@@ -63,8 +63,8 @@ def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, leng
     trainer = SimpleNamespace(
         global_step=step, accumulate_grad_batches=accumulated, num_training_batches=limit
     )
-    assert trained_batches(trainer, length) == batches
-    assert trained_batches(None, length) == 0
+    assert count_trained_batches(trainer, length) == batches
+    assert count_trained_batches(None, length) == 0
 
 
 def test_depths_are_read_where_something_compares_with_them(boxes):
@@ -179,14 +179,14 @@ def test_processes_by_cores_devices_and_batches(monkeypatch, count, processes, o
     """A GPU leaves the cores to loading, a CPU none;
     a few batches come sooner than a process starts."""
     monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "fork")
-    assert automatic_workers(count, processes, on_gpu, cores) == expected
+    assert choose_workers(count, processes, on_gpu, cores) == expected
 
 
 def test_processes_that_import_pytorch_first_start_for_more_batches(monkeypatch):
     """As on macOS, where a start takes seconds."""
     monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "spawn")
-    assert automatic_workers(100, 1, True, 96) == 0
-    assert automatic_workers(1000, 1, True, 96) == 8
+    assert choose_workers(100, 1, True, 96) == 0
+    assert choose_workers(1000, 1, True, 96) == 8
 
 
 def test_automatic_processes_are_said_once_and_load_the_same(boxes, caplog):
@@ -194,7 +194,7 @@ def test_automatic_processes_are_said_once_and_load_the_same(boxes, caplog):
     with caplog.at_level(logging.INFO):
         data = rendered(boxes, workers="auto", steps_per_epoch=3)
         loader = data.train_dataloader()
-        assert loader.num_workers == automatic_workers(MANY, 1, False)
+        assert loader.num_workers == choose_workers(MANY, 1, False)
         assert data.val_dataloader().num_workers == 0
     assert sum("data.workers=auto" in record.message for record in caplog.records) == 1
     expected = rendered(boxes, workers=0, steps_per_epoch=3).train_dataloader()
@@ -235,7 +235,7 @@ class Signalled:
 
 def test_an_announced_end_leaves_loading_to_the_training():
     """SLURM sends the signal to all processes of a job; a worker ended, and with it the training."""
-    assert list(loader_of(Signalled(), 1)) == [0, 1, 2]
+    assert list(make_loader(Signalled(), 1)) == [0, 1, 2]
 
 
 def test_an_interrupt_ends_all_processes_without_their_traces(boxes):

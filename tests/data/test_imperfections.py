@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion, zoom
 
-from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.data.imperfections import draw_backgrounds, draw_color_gains, perturb_cameras, perturb_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.types import Cameras
@@ -29,7 +29,7 @@ def test_gains_stay_within_their_stops_and_change_nothing_on_average():
     """A stop doubles the light; stored values are light to the power 1/2.2."""
     largest = np.zeros(3)
     for seed in range(40):
-        gains = color_gains(4, 0.5, 0.2, np.random.default_rng(seed))
+        gains = draw_color_gains(4, 0.5, 0.2, np.random.default_rng(seed))
         stops = 2.2 * np.log2(gains)
         np.testing.assert_allclose(stops.mean(0), 0, atol=1e-9)
         tint = stops - stops[:, [1]]
@@ -46,7 +46,7 @@ def test_masks_grow_shrink_and_fray_within_their_pixels():
     both = 0
     for seed in range(12):
         for offset, ragged in ((3, 0), (0, 3), (1.5, 1.5)):
-            found = imperfect_mask(mask, offset, ragged, 0, 0, np.random.default_rng(seed))
+            found = perturb_mask(mask, offset, ragged, 0, 0, np.random.default_rng(seed))
             # The outline lies half a pixel from the centres of its pixels.
             assert not (found & ~binary_dilation(mask, disc(3.5))).any()
             assert not (binary_erosion(mask, disc(3.5)) & ~found).any()
@@ -64,7 +64,7 @@ def test_masks_grow_shrink_and_fray_within_their_pixels():
 def test_backgrounds_are_patches_that_scipy_enlarges(size):
     """The same random numbers by another interpolation:
     patterns agree to the rounding of float32."""
-    found = backgrounds(2, *size, np.random.default_rng(4))
+    found = draw_backgrounds(2, *size, np.random.default_rng(4))
     rng = np.random.default_rng(4)
     expected = 0.5 + rng.uniform(-0.2, 0.2, (2, 3, 1, 1)) + 0.02 * rng.standard_normal((2, 3, *size))
     for cells, deviation in ((3, 0.35), (12, 0.15), (40, 0.06)):
@@ -77,7 +77,7 @@ def test_a_missing_piece_is_round_and_not_larger_than_its_share():
     """What is missing fits into a circle; the chance decides how often, 0 never."""
     mask, missing = figure(), 0
     for seed in range(60):
-        found = imperfect_mask(mask, 0, 0, 0.2, 0.5, np.random.default_rng(seed))
+        found = perturb_mask(mask, 0, 0, 0.2, 0.5, np.random.default_rng(seed))
         gone = np.argwhere(mask & ~found)
         assert not (found & ~mask).any()
         missing += len(gone) > 0
@@ -85,14 +85,14 @@ def test_a_missing_piece_is_round_and_not_larger_than_its_share():
             distances = np.linalg.norm(gone[:, None] - gone, axis=-1)
             assert distances.max() <= 0.2 * 75
     assert 15 < missing < 40
-    np.testing.assert_array_equal(imperfect_mask(mask, 0, 0, 0.2, 0, np.random.default_rng(0)), mask)
+    np.testing.assert_array_equal(perturb_mask(mask, 0, 0, 0.2, 0, np.random.default_rng(0)), mask)
 
 
 @pytest.mark.parametrize("mask", [np.eye(1, 30, 7, bool).repeat(20, 0), np.ones((14, 28), bool)])
 def test_no_mask_is_emptied(mask):
     """A line one pixel wide, and a subject that fills the photograph."""
     for seed in range(20):
-        assert imperfect_mask(mask, 4, 4, 3.0, 1.0, np.random.default_rng(seed)).any()
+        assert perturb_mask(mask, 4, 4, 3.0, 1.0, np.random.default_rng(seed)).any()
 
 
 def ring(shift=0.0, dtype=torch.float64) -> tuple[Cameras, torch.Tensor, torch.Tensor]:
@@ -127,7 +127,7 @@ def test_calibration_errors_move_the_subject_by_their_pixels(limit):
     cameras, masks, points = ring()
     errors = []
     for seed in range(25):
-        found = miscalibrated(cameras, masks, limit, np.random.default_rng(seed))
+        found = perturb_cameras(cameras, masks, limit, np.random.default_rng(seed))
         errors.append(moved_by(found, cameras, points))
         rotation = found.extrinsics[:, :3, :3]
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(4, 3, 3))
@@ -145,7 +145,7 @@ def test_calibration_errors_have_nothing_in_common():
     true = cameras.extrinsics
     middle = torch.tensor([0, 0.9, 0]).double()
     for seed in range(10):
-        found = miscalibrated(cameras, masks, 3.0, np.random.default_rng(seed))
+        found = perturb_cameras(cameras, masks, 3.0, np.random.default_rng(seed))
         zoom = found.intrinsics[:, 0, 0] / cameras.intrinsics[:, 0, 0]
         assert zoom.std() > 1e-3
         assert abs(zoom.mean() - 1) < 1e-6
@@ -165,7 +165,7 @@ def test_calibration_errors_do_not_depend_on_the_worlds_origin():
     results = []
     for shift in (0.0, 1000.0):
         cameras, masks, points = ring(shift)
-        found = miscalibrated(cameras, masks, 2.0, np.random.default_rng(3))
+        found = perturb_cameras(cameras, masks, 2.0, np.random.default_rng(3))
         results.append(moved_by(found, cameras, points))
     torch.testing.assert_close(*results, rtol=1e-3, atol=0)
 
@@ -174,9 +174,9 @@ def test_a_photograph_without_the_subject_is_no_obstacle():
     """Small sizes may lose a mask: it stays empty, and its camera has an error like others."""
     cameras, masks, points = ring()
     masks[1] = False
-    found = miscalibrated(cameras, masks, 2.0, np.random.default_rng(0))
+    found = perturb_cameras(cameras, masks, 2.0, np.random.default_rng(0))
     assert 0 < moved_by(found, cameras, points)[1] < 2.3
-    assert not imperfect_mask(masks[1].numpy(), 2, 2, 0.2, 1.0, np.random.default_rng(0)).any()
+    assert not perturb_mask(masks[1].numpy(), 2, 2, 0.2, 1.0, np.random.default_rng(0)).any()
 
 
 def test_cameras_that_look_away_from_one_another_are_refused():
@@ -185,4 +185,4 @@ def test_cameras_that_look_away_from_one_another_are_refused():
     turned = cameras.extrinsics.clone()
     turned[:, [0, 2]] *= -1  # by half a turn
     with pytest.raises(InputError, match=r"augmentation\.calibration: expected cameras that look at"):
-        miscalibrated(Cameras(cameras.intrinsics, turned, 96, 72), masks, 1.0, np.random.default_rng(0))
+        perturb_cameras(Cameras(cameras.intrinsics, turned, 96, 72), masks, 1.0, np.random.default_rng(0))

@@ -181,7 +181,7 @@ def test_data_that_cannot_be_written_to_is_packed_in_the_cache(root, tmp_path, m
     assert same(root)
     assert not files(root)
     assert len(list((tmp_path / "cache" / "packed").glob("*/*.safetensors"))) == 2
-    assert packed.folder_of(root) != packed.folder_of(tmp_path)
+    assert packed.choose_folder(root) != packed.choose_folder(tmp_path)
 
 
 def test_short_trainings_write_nothing(root):

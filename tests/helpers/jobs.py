@@ -61,9 +61,9 @@ def job(cfg) -> float | str | None:
 def load_and_record(run: Run, directory: Path, stats: dict[str, Any]) -> float:
     """:func:`record_execution` after two batches."""
     if run.data.workers != "auto":
-        from ghgs_lit.data.batches import loader_of
+        from ghgs_lit.data.batches import make_loader
 
-        assert list(loader_of([1, 2], run.data.workers)) == [1, 2]
+        assert list(make_loader([1, 2], run.data.workers)) == [1, 2]
     return record_execution(run, directory, stats)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
-from ghgs_lit.data.imperfections import miscalibrated
+from ghgs_lit.data.imperfections import perturb_cameras
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, Cameras, Targets
 from tests.helpers.cameras import camera_ring
@@ -62,7 +62,7 @@ def painted_ellipsoid(cameras):
 def off(batch, pixels=2.0, seeds=(0,)):
     """The batch with cameras that are off by up to ``pixels``."""
     found = [
-        miscalibrated(batch.cameras[b], batch.masks[b], pixels, np.random.default_rng(seed))
+        perturb_cameras(batch.cameras[b], batch.masks[b], pixels, np.random.default_rng(seed))
         for b, seed in enumerate(seeds)
     ]
     stacked = (torch.stack([getattr(one, name) for one in found]) for name in ("intrinsics", "extrinsics"))

@@ -9,7 +9,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.data.batches import StepSampler
-from ghgs_lit.data.datamodule import trained_batches
+from ghgs_lit.data.datamodule import count_trained_batches
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.rendering import render
 from ghgs_lit.training import GHGSModule
@@ -133,7 +133,7 @@ class StepData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader:
         steps = _Steps(self.length)
-        sampler = StepSampler(steps, lambda: trained_batches(self.trainer, self.length))
+        sampler = StepSampler(steps, lambda: count_trained_batches(self.trainer, self.length))
         return DataLoader(steps, batch_size=None, collate_fn=lambda b: b, sampler=sampler)
 
     def val_dataloader(self) -> DataLoader:
