@@ -52,18 +52,14 @@ def _texts(table: Table, write: Write) -> pd.DataFrame:
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
-def _blocks(table: Table, write: Write) -> list[tuple[str, list[tuple[str, list[str]]]]]:
-    """Reported lines, then measured ones: a title and, for each line, its kind and cells; none is empty."""
+def _blocks(table: Table, write: Write) -> dict[str, list[tuple[str, list[str]]]]:
+    """Kind and cells of each line by the title of its block: the reported ones, then the measured ones."""
     numbers = _texts(table, write)
-    titles = {True: f"as reported on {table.reported_on}, not measured here", False: "measured here"}
-    blocks = []
-    for is_reported, title in titles.items():
-        lines = [
-            (line.variant.kind, [*line.stub, *numbers.loc[i]])
-            for i, line in enumerate(table.lines)
-            if (line.variant.kind == "reported") == is_reported
-        ]
-        blocks += [(title, lines)] * bool(lines)
+    blocks: dict[str, list[tuple[str, list[str]]]] = {}
+    for number, (variant, stub) in enumerate(table.lines):
+        is_reported = variant.kind == "reported"
+        title = f"as reported on {table.reported_on}, not measured here" if is_reported else "measured here"
+        blocks.setdefault(title, []).append((variant.kind, [*stub, *numbers.loc[number]]))
     return blocks
 
 
@@ -80,7 +76,7 @@ def to_markdown(table: Table) -> str:
         title = f"{metric.title} {metric.arrow}".strip()
         names.append(f"{group.title} {title}" if table.layout.heading != "none" else title)
     rows = []
-    for title, lines in _blocks(table, write):
+    for title, lines in _blocks(table, write).items():
         if table.reported_on:
             rows.append([f"*{title}*", *[""] * (len(names) - 1)])
         rows += [cells for _, cells in lines]
@@ -98,7 +94,7 @@ def to_terminal(table: Table) -> str:
     for (i, line), (number, group) in itertools.product(enumerate(table.lines), enumerate(table.groups)):
         mark = "† " if line.variant.kind == "reported" else ""
         rows.append([mark + line.stub[0], *line.stub[1:], group.title, *numbers.loc[i][number]])
-    names = [*table.stub, "", *("{0} {2}".format(*metric_of(name)) for name in table.metrics)]
+    names = [*table.stub, "", *(f"{metric.title} {metric.arrow}" for metric in map(metric_of, table.metrics))]
     text = tabulate(rows, names, disable_numparse=True)
     caption = table.caption.replace("in bold", f"marked{BEST}")
     text = "\n\n".join((caption, text, *table.notes)) + "\n"
@@ -231,7 +227,7 @@ def _tabular(table: Table) -> str:
     """The ``tabular`` environment, with rules above blocks."""
     rows = [rf"\begin{{tabular}}{{{_columns(table)}}}", r"\toprule", *_head(table)]
     count = len(table.stub)
-    for title, lines in _blocks(table, _number):
+    for title, lines in _blocks(table, _number).items():
         rows.append(r"\midrule")
         if table.reported_on:
             title = rf"\multicolumn{{{len(lines[0][1])}}}{{l}}{{\emph{{{escape(title)}}}}} \\"
