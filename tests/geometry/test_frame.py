@@ -57,6 +57,8 @@ def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away
     assert found.gaussians.splits == expected.gaussians.splits
     # float64 rounds to 1e-11 m at 100 km, which can change the last digit of a camera in float32.
     limit = 1e-5 + 2e-9 * away
+    # In float32 points 100 km away are rounded to 8 mm.
+    assert found.gaussians.means.dtype == found.points.tokens.dtype == torch.float64
     back = (found.gaussians.means - torch.tensor(shift).double()) @ turn / scale
     assert (back - expected.gaussians.means).abs().max() < limit
     back = (found.points.tokens - torch.tensor(shift).double()) @ turn / scale
@@ -100,20 +102,26 @@ def test_the_subject_is_as_tall_as_a_person_in_its_frame():
         assert frame.enter(batch).cameras.extrinsics.dtype == torch.float32
 
 
+def size_with(batch, masks):
+    """Size of the subject with other masks, relative to that with its own."""
+    found, right = (Frame.of(b).metre for b in (dataclasses.replace(batch, masks=masks), batch))
+    return float(found / right)
+
+
 @pytest.mark.parametrize("wrong", ["empty", "one pixel", "noise", "half"])
 @pytest.mark.parametrize("views", [3, 4])
 def test_one_wrong_mask_does_not_change_the_size(views, wrong):
     batch = make_batch(1, views, 112, 112)
+    noise = torch.rand(112, 112, generator=torch.Generator().manual_seed(0)) < 0.3
+    rows, columns = torch.arange(112)[:, None], torch.arange(112)
     masks = batch.masks.clone()
-    if wrong == "noise":
-        masks[0, -1] = torch.rand(masks.shape[2:], generator=torch.Generator().manual_seed(0)) < 0.3
-    elif wrong == "half":
-        masks[0, -1, 56:] = False
-    else:
-        masks[0, -1] = False
-        masks[0, -1, 3, 5] = wrong == "one pixel"
-    found, right = (Frame.of(b).metre for b in (dataclasses.replace(batch, masks=masks), batch))
-    assert float(found / right) == pytest.approx(1, abs=0.25)
+    masks[0, -1] = {
+        "empty": torch.zeros(112, 112, dtype=torch.bool),
+        "one pixel": (rows == 3) & (columns == 5),
+        "noise": noise,
+        "half": masks[0, -1] & (rows < 56),
+    }[wrong]
+    assert size_with(batch, masks) == pytest.approx(1, abs=0.25)
 
 
 @pytest.mark.parametrize("view", [0, 1])
@@ -121,10 +129,9 @@ def test_of_two_sizes_the_larger_counts(view):
     """Masks are more often too small than too large."""
     batch = make_batch(1, 2, 112, 112, spread=180.0)
     masks = batch.masks.clone()
-    rows = torch.arange(112)
-    masks[0, view] &= ((rows > 40) & (rows < 70))[:, None]  # the middle alone
-    found, right = (Frame.of(b).metre for b in (dataclasses.replace(batch, masks=masks), batch))
-    assert float(found / right) == pytest.approx(1, abs=0.1)
+    masks[0, view, :41] = False  # the middle alone
+    masks[0, view, 70:] = False
+    assert size_with(batch, masks) == pytest.approx(1, abs=0.1)
 
 
 def test_a_subject_that_is_wider_than_tall_has_the_size_of_its_width():
@@ -143,24 +150,23 @@ def test_a_subject_that_is_wider_than_tall_has_the_size_of_its_width():
     torch.testing.assert_close(Frame.of(turned).metre, Frame.of(batch).metre, rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("change", ["mirrored", "upside down", "looking down", "opposed", "degenerate"])
+MIRROR, HALF_TURN = torch.diag(torch.tensor([-1.0, 1.0, 1.0])), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+DOWN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+ROTATIONS = {
+    "mirrored": lambda rotation: MIRROR @ rotation,
+    "upside down": lambda rotation: HALF_TURN @ rotation,
+    "looking down": lambda rotation: DOWN.expand_as(rotation),
+    "opposed": lambda rotation: torch.cat((rotation[:, :1], *[rotation[:, :1] @ HALF_TURN] * 2), 1),
+    "degenerate": torch.zeros_like,
+}
+
+
+@pytest.mark.parametrize("change", ROTATIONS)
 def test_axes_are_a_rotation_for_any_cameras(change):
     """Mirrored extrinsics, rigs upside down and cameras that look straight down have a frame,
     too."""
-    batch = make_batch(1, 3, 42, 42)
-    cameras = ring(1, 3, 42, 42)
-    rotation = cameras.extrinsics[..., :3, :3].clone()
-    if change == "mirrored":
-        rotation[..., 0, :] *= -1
-    elif change == "upside down":
-        rotation[..., :2, :] *= -1
-    elif change == "looking down":
-        rotation[:] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    elif change == "opposed":
-        rotation[0, 1:] = rotation[0, :1] @ torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
-    else:
-        rotation[:] = 0
-    cameras.extrinsics[..., :3, :3] = rotation
+    batch, cameras = make_batch(1, 3, 42, 42), ring(1, 3, 42, 42)
+    cameras.extrinsics[..., :3, :3] = ROTATIONS[change](cameras.extrinsics[..., :3, :3].clone())
     axes = Frame.of(dataclasses.replace(batch, cameras=cameras)).axes
     torch.testing.assert_close(axes @ axes.mT, torch.eye(3).double()[None], atol=1e-9, rtol=0)
     assert float(torch.linalg.det(axes)) == pytest.approx(1)
@@ -225,17 +231,3 @@ def test_units_of_nested_frames_are_multiplied():
     world = torch.zeros(1, 4, 3)
     assert frame._gaussians(inner, 3, world).metre.tolist() == [10.0]
     assert frame._gaussians(dataclasses.replace(inner, metre=None), 3, world).metre.tolist() == [2.5]
-
-
-def test_points_far_from_the_worlds_origin_keep_their_digits():
-    """100 km away float32 knows 8 mm: what leaves the frame has the precision of the cameras."""
-    _, batch, expected, _ = original("hull")
-    away = torch.tensor([1e5, -3e4, 2e4]).double()
-    with torch.no_grad():
-        far = dataclasses.replace(batch, cameras=moved(batch.cameras, shift=tuple(away.tolist())))
-        found = predict(original("hull")[0], far)
-    for one, other in (
-        (found.gaussians.means, expected.gaussians.means), (found.points.tokens, expected.points.tokens),
-    ):  # fmt: skip
-        assert one.dtype == torch.float64
-        assert (one - away - other).abs().max() < 2e-4

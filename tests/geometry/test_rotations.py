@@ -1,17 +1,25 @@
-"""Quaternions against SciPy."""
+"""Quaternions against SciPy, directions of vectors of any length, and motions of cameras relative to one
+another."""
 
 import math
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.geometry.rotations import (
+    after_motions,
     matrix_to_quaternion,
+    motions_between,
     multiply_quaternions,
     quaternion_to_matrix,
+    rigid,
     rotate,
+    unit,
+    without_common,
 )
+from tests.helpers.scenes import ring
 
 
 def test_quaternions_of_matrices_and_their_products():
@@ -27,3 +35,92 @@ def test_quaternions_of_matrices_and_their_products():
     moved = rotate(found, torch.from_numpy(vectors).flip(0))
     expected = Rotation.from_rotvec(vectors).apply(vectors[::-1])
     torch.testing.assert_close(moved, torch.from_numpy(expected), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("length", [1e-30, 1e-20, 1.0, 1e19, 1e30])
+def test_a_direction_and_its_gradient_do_not_depend_on_the_length(length):
+    """Squares vanished below 5e-14, where the gradient became infinite,
+    and overflowed from 1e19 on."""
+    vector = torch.tensor([0.48, -0.6, 0.64, 0.0])
+    x = (vector * length).requires_grad_()
+    y = unit(x)
+    torch.testing.assert_close(y.detach(), vector, rtol=1e-6, atol=1e-7)
+    (gradient,) = torch.autograd.grad(y[0], x)
+    expected = torch.eye(4)[0] - vector[0] * vector
+    torch.testing.assert_close(gradient * length, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_zero_stays_zero_without_a_gradient():
+    """It has no direction, and its gradient must not become NaN."""
+    x = torch.zeros(2, 4, requires_grad=True)
+    y = unit(x, 0.1)
+    y.sum().backward()
+    assert (y == 0).all()
+    assert (x.grad == 0).all()
+
+
+def test_a_gradient_is_bounded_where_that_is_asked_for():
+    """Near the zero quaternion one splat would own the whole clipped gradient."""
+    vector = torch.tensor([0.6, 0.8])
+    for length in (1e-12, 1e-3, 0.1, 5.0):
+        x = (vector * length).requires_grad_()
+        (gradient,) = torch.autograd.grad(unit(x, 0.1)[0], x)
+        assert gradient.norm() == pytest.approx(0.8 / max(length, 0.1), rel=1e-4)
+
+
+def test_gradients_are_those_of_finite_differences():
+    x = torch.randn(5, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(unit, (x.requires_grad_(),))
+
+
+def test_what_cameras_share_is_taken_out_and_the_rest_stays():
+    """A turn, a shift, and a way along the optical axes that all have;
+    differences keep their size."""
+    g = torch.Generator().manual_seed(0)
+    axes = torch.nn.functional.normalize(torch.randn(2, 4, 3, generator=g), dim=-1)
+    motions = torch.randn(2, 4, 6, generator=g)
+    shared = torch.randn(2, 1, 6, generator=g).expand(-1, 4, -1).clone()
+    apart = without_common(motions, axes)
+    torch.testing.assert_close(without_common(motions + shared, axes), apart, rtol=0, atol=1e-5)
+    assert (apart[..., :3].mean(1)).abs().max() < 1e-6
+    assert (apart[..., 3:] * axes).sum(-1).mean(1).abs().max() < 1e-6
+    turns = motions[..., :3] - motions[..., :3].mean(1, keepdim=True)
+    torch.testing.assert_close(apart[..., :3], turns)
+
+
+def test_what_cameras_share_is_what_photographs_show():
+    """Left and right camera move along their axes, which shows little:
+    the others stay where they are."""
+    axes = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    motions = torch.zeros(4, 6)
+    motions[:, 3] = torch.tensor([0.1, 0.0, -0.1, 0.0])
+    # As motions of points: front and back camera see them go apart, and no mean of them is a rig's.
+    torch.testing.assert_close(without_common(motions, axes), motions)
+    along = motions.clone()
+    along[1, 3] = 1.0
+    across = without_common(along, axes)[[0, 2], 3] - motions[[0, 2], 3]
+    assert across.abs().max() < 0.01
+
+
+def test_small_motions_turn_and_shift_points():
+    """A turn by a hundredth moves a point by that share of its distance from the axis;
+    shifts have a unit."""
+    rotation, shift = rigid(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.5]), length=2.0)
+    point = rotation @ torch.tensor([1.0, 0.0, 0.0]) + shift
+    torch.testing.assert_close(point, torch.tensor([1.0, 0.01, 1.0]), rtol=0, atol=1e-4)
+
+
+def test_cameras_that_moved_tell_their_motions():
+    """Also where the middle is a kilometre away from the world's origin."""
+    middle = torch.tensor([1000.0, 1.0, -500.0], dtype=torch.float64)
+    before = ring(1, 4, 42, 42).extrinsics[0].double()
+    before[:, :3, 3] -= before[:, :3, :3] @ middle
+    motions = 1e-3 * torch.randn(4, 6, generator=torch.Generator().manual_seed(1)).double()
+    after = after_motions(before, motions, middle)
+    found = motions_between(before, after, middle)
+    torch.testing.assert_close(found, motions, rtol=1e-5, atol=1e-9)
+    point = middle + 0.3
+    rotations, shifts = rigid(motions)
+    moved = (rotations @ (point - middle)) + middle + shifts
+    seen = (before[:, :3, :3] @ moved[..., None])[..., 0] + before[:, :3, 3]
+    torch.testing.assert_close(after[:, :3, :3] @ point + after[:, :3, 3], seen, rtol=0, atol=1e-9)

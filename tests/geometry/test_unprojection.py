@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection, subject_tokens
 from ghgs_lit.method.heads.depth import inverse_linear
@@ -84,9 +83,3 @@ def test_unprojection_of_kept_tokens_only():
     every = Unprojection()(maps, tokens, batch)
     keep = torch.arange(0, len(tokens.image), 3)
     assert torch.equal(Unprojection()(maps, tokens.select(keep), batch).tokens, every.tokens[keep])
-
-
-def test_impossible_token_points_are_refused():
-    """A bad value is found when the configuration is read, by its key."""
-    with pytest.raises(InputError, match=r"unprojection\.tokens"):
-        Unprojection(tokens="center")
