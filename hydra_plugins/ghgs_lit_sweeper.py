@@ -1,5 +1,5 @@
 """The sweeper's class, which Hydra finds only in ``hydra_plugins``;
-``ghgs_lit.runs.grid`` does the work."""
+``ghgs_lit.runs.sweep`` does the work."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ class GridSweeper(basic_sweeper.BasicSweeper):
         self.verb = getattr(task_function, "name", self.verb)
 
     def sweep(self, arguments: list[str]) -> Any:
-        from ghgs_lit.runs.grid import sweep  # Hydra imports its plugins for every application
+        from ghgs_lit.runs.sweep import sweep  # Hydra imports its plugins for every application
 
         return sweep(self, arguments, rehearse)
 

@@ -24,7 +24,7 @@ from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.ply import ply_bytes
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.runs.provenance import versions
+from ghgs_lit.runs.results import versions
 from ghgs_lit.runtime.cores import allowed_cores
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet, to_uint8

@@ -25,8 +25,8 @@ from ghgs_lit.config.registry import read_nodes, verb_class
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.runs.job import register_resolvers
+from ghgs_lit.runs.processes import interruptible
 from ghgs_lit.runs.run import SESSIONS, WRITTEN, RunDirectory
-from ghgs_lit.runs.signals import interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again
 from ghgs_lit.runtime.cores import children_sleep
 

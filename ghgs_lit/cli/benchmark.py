@@ -21,8 +21,7 @@ from ghgs_lit.diagnostics.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.output import document, print_tables
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.runs.results import plain
+from ghgs_lit.runs.results import plain, provenance
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 

@@ -6,7 +6,7 @@ import signal
 import sys
 import warnings
 
-from ghgs_lit.runs.signals import Interrupted, interruptible
+from ghgs_lit.runs.processes import Interrupted, interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again, keep_freed_memory
 from ghgs_lit.runtime.cores import spin_if_alone
 

@@ -22,7 +22,7 @@ from ghgs_lit.diagnostics.stress.whole import STAGES
 from ghgs_lit.errors import choice, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.progress import track
-from ghgs_lit.runs.provenance import provenance
+from ghgs_lit.runs.results import provenance
 from ghgs_lit.runtime.cores import allowed_cores
 
 if TYPE_CHECKING:

@@ -24,10 +24,16 @@ from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write, table_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.processes import in_srun, queue_again, settle_rank
+from ghgs_lit.runs.processes import (
+    Interrupted,
+    in_srun,
+    interruptible,
+    print_how_to_go_on,
+    queue_again,
+    settle_rank,
+)
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 from ghgs_lit.training import GHGSModule, loggers, start
 from ghgs_lit.training.callbacks import NeighborsAtStart
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep

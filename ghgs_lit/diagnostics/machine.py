@@ -12,7 +12,7 @@ import torch
 from rich.filesize import decimal
 
 from ghgs_lit.rendering import gsplat_backend
-from ghgs_lit.runs.provenance import version_of
+from ghgs_lit.runs.results import version_of
 from ghgs_lit.runtime.cores import allowed_cores
 
 DISTRIBUTION = "ghgs-lit"

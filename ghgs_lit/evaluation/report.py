@@ -13,8 +13,7 @@ from ghgs_lit.config.keys import ablation_of
 from ghgs_lit.config.run import Run
 from ghgs_lit.evaluation.measure import Method, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
-from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.runs.results import METHOD, Row, summarize, write_results
+from ghgs_lit.runs.results import METHOD, Row, provenance, summarize, write_results
 
 #: Print a line once per process: all runs of a sweep lack the same.
 print_once = cache(print)

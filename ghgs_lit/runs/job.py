@@ -17,7 +17,7 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
-from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.results import config_hash
 from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, begun_by_job
 
 if TYPE_CHECKING:

@@ -1,10 +1,15 @@
-"""The processes of a training: how many there are, which one this is,
-and the SLURM job that they are in."""
+"""The processes of a training: how many there are, which one this is, the SLURM job that they are in,
+and the signals that stop them (exit code 128 + their number)."""
 
+import contextlib
 import os
 import signal
 import subprocess
-from typing import TYPE_CHECKING
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ghgs_lit.training.trainer import TrainerOptions
@@ -109,3 +114,146 @@ def queue_again(number: int) -> bool:
         return subprocess.run(["scontrol", "requeue", job], check=False).returncode == 0
     except OSError:
         return False
+
+
+#: What ``sbatch --signal`` is asked to send before the end of a job's time.
+ANNOUNCED = (signal.SIGUSR1, signal.SIGUSR2)
+STOP = (signal.SIGINT, signal.SIGTERM, *ANNOUNCED)
+
+
+class Interrupted(SystemExit):
+    """This process was asked to stop by a signal; the exit code is 128 + its number.
+
+    A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and
+    starts the next one.
+
+    Args:
+        number: of the signal.
+
+    Attributes:
+        explained: whether the line that says how to go on was printed.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.number = number
+        self.explained = False
+
+
+class _Handler:
+    """Signal handler that calls ``act(number)`` only in the process that made it,
+    not in forked workers."""
+
+    def __init__(self, act: Callable[[int], Any]) -> None:
+        self.act = act
+        self.process = os.getpid()
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() == self.process:
+            self.act(number)
+        elif number == signal.SIGTERM:  # sent by a parent to end its workers
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+
+
+#: Interruptions of the present outermost :func:`interruptible`.
+_received: list[Interrupted] = []
+
+
+def interrupt(number: int) -> None:
+    """Raise :class:`Interrupted`.
+
+    Args:
+        number: Of the signal.
+
+    Raises:
+        Interrupted: Always.
+    """
+    _received.append(Interrupted(number))
+    raise _received[-1]
+
+
+def stop_if_interrupted() -> None:
+    """Raise an interruption again that was lost.
+
+    A signal may arrive while a library restores something in a ``finally``: what it raises then
+    hides the interruption, and whoever expects such an error drops both.
+
+    Raises:
+        Interrupted: A signal has arrived in the present :func:`interruptible`.
+    """
+    if _received:
+        raise _received[-1]
+
+
+def handlers() -> dict[int, Any]:
+    """Present handlers of these signals, without those that were not set from Python."""
+    present = {number: signal.getsignal(number) for number in STOP}
+    return {number: handler for number, handler in present.items() if handler is not None}
+
+
+def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
+    """Let a function handle signals, except those that others handle and that do not announce an
+    end: under submitit SIGTERM does not end a job.
+
+    Args:
+        act: Gets the number of the signal.
+        before: Handlers by signal, as of :func:`handlers`.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return  # signals belong to the main thread
+    for number, handler in before.items():
+        is_lent = number in ANNOUNCED and callable(handler)
+        signal.signal(number, _Handler(act) if is_lent or _is_free(handler) else handler)
+
+
+def _is_free(handler: Any) -> bool:
+    return handler in (signal.SIG_DFL, signal.default_int_handler) or isinstance(handler, _Handler)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise :class:`Interrupted` on the signals :data:`STOP` unless others handle them; where it is
+    lost (:func:`stop_if_interrupted`), once more at the end of the block. Handlers of others for an
+    announced end, as submitit's, which queues the job again, are called at the end of the block."""
+    before = handlers()
+    is_outermost = not any(isinstance(handler, _Handler) for handler in before.values())
+    handle(interrupt, before)
+    try:
+        stop_if_interrupted()
+        yield
+        stop_if_interrupted()
+    except Exception:
+        stop_if_interrupted()
+        raise
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        if is_outermost and _received:
+            number = _received.pop().number
+            _received.clear()
+            _pass_on(number, before[number])
+
+
+def _pass_on(number: int, handler: Any) -> None:
+    """Call the handler that others have set for a signal, if any."""
+    if not _is_free(handler):
+        # The program that queues a job again may be ended with it before it returns.
+        with contextlib.suppress(subprocess.CalledProcessError):
+            handler(number, None)
+
+
+def print_how_to_go_on(stop: Interrupted, what: str, how: str, is_queued: bool) -> None:
+    """Print to stderr what was stopped, and how it goes on.
+
+    Args:
+        stop: The interruption; it counts as explained from then on.
+        what: What was stopped.
+        how: Text that says which command goes on.
+        is_queued: Whether SLURM will run it again.
+    """
+    stop.explained = True
+    name = signal.Signals(stop.number).name
+    how = "SLURM queues its job again" if is_queued else how
+    print(f"ghgs: {what} was interrupted ({name}); {how}", file=sys.stderr)

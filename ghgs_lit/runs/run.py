@@ -37,8 +37,7 @@ from ghgs_lit.files import (
 )
 from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
 from ghgs_lit.runs.processes import is_queued_again, launch, slurm_job
-from ghgs_lit.runs.provenance import config_hash, differences
-from ghgs_lit.runs.results import read_results, validated
+from ghgs_lit.runs.results import config_hash, differences, read_results, validated
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from ghgs_lit.config.options import Index, Options, Text, Words
 from ghgs_lit.files import write_atomically
-from ghgs_lit.runs.signals import handle, handlers, interrupt
+from ghgs_lit.runs.processes import handle, handlers, interrupt
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.reading import open_file
 

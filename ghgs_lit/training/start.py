@@ -10,7 +10,7 @@ from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.method.stages import STAGES
-from ghgs_lit.runs.provenance import differences
+from ghgs_lit.runs.results import differences
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pytest
 
 from ghgs_lit.cli.main import main
 from ghgs_lit.config import registry
-from ghgs_lit.runs.signals import handlers
+from ghgs_lit.runs.processes import handlers
 from tests.helpers.processes import run_python
 
 _COMMAND = """

@@ -18,7 +18,7 @@ from ghgs_lit.evaluation.measure import ModelMethod, measure_all
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.results import config_hash
 from tests.helpers.models import load_model
 from tests.helpers.people import rendered
 from tests.helpers.training import Standin

@@ -16,12 +16,10 @@ from ghgs_lit.config.reading import reading_as_ghgs
 from ghgs_lit.config.registry import verb_class
 from ghgs_lit.config.run import Run
 from ghgs_lit.runs import job as job_module
-from ghgs_lit.runs.grid import run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
-from ghgs_lit.runs.planned import PlannedRun, Rehearsal
-from ghgs_lit.runs.provenance import config_hash, provenance
-from ghgs_lit.runs.results import write_results
+from ghgs_lit.runs.results import config_hash, provenance, write_results
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.sweep import PlannedRun, Rehearsal, run_all
 
 register_resolvers()
 

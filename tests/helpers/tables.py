@@ -6,8 +6,7 @@ import yaml
 
 from ghgs_lit.config.keys import ABLATIONS
 from ghgs_lit.evaluation import tables as t
-from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.results import write_results
+from ghgs_lit.runs.results import config_hash, write_results
 
 SWITCHES = {name: switches for switches, name in ABLATIONS.items()}
 SHIFTS = {"a": -1.0, "b": 1.0}

@@ -22,3 +22,10 @@ def sweep(monkeypatch, capsys, tmp_path):
 
     run.directory = tmp_path / "sweep"
     return run
+
+
+@pytest.fixture
+def verb(monkeypatch, capsys):
+    """``verb("seed=1")`` runs ``ghgs train`` without training."""
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    return lambda *overrides: call(monkeypatch, capsys, "train", *overrides)

@@ -3,23 +3,14 @@ presets that depend on the training."""
 
 import pytest
 
-from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.job import check_config
-from tests.cli.test_main import call
-from tests.helpers.jobs import executed, record_execution
+from tests.helpers.jobs import executed
 
 
 def run(*overrides: str):
     return run_of("train", overrides)
-
-
-@pytest.fixture
-def verb(monkeypatch, capsys):
-    """``verb("seed=1")`` runs ``ghgs train`` without training."""
-    monkeypatch.setattr(train_verb, "train", record_execution)
-    return lambda *overrides: call(monkeypatch, capsys, "train", *overrides)
 
 
 def test_a_frozen_encoder_without_weights_is_refused(verb, tmp_path):

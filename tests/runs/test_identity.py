@@ -9,14 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import run_of
 from ghgs_lit.config.compose import saved_text
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job
-from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.results import config_hash
 from ghgs_lit.runs.run import MARKER, PLAN, SWEPT, RunDirectory, State
-from tests.cli.test_main import call
 from tests.helpers.jobs import hold_run, record_execution, write_finished_run
 from tests.helpers.processes import PREPARED
 
@@ -53,13 +51,6 @@ def killed(path, run=RUN, checkpoint=True) -> list:
 
 def finished(path, run=RUN) -> float:
     return job.train_once(RunDirectory(path), run, record_execution)
-
-
-@pytest.fixture
-def verb(monkeypatch, capsys):
-    """``verb("seed=1")`` runs ``ghgs train`` without training."""
-    monkeypatch.setattr(train_verb, "train", record_execution)
-    return lambda *overrides: call(monkeypatch, capsys, "train", *overrides)
 
 
 def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):

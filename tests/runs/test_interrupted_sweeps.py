@@ -11,7 +11,7 @@ import pytest
 from ghgs_lit.cli import application
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import grid
+from ghgs_lit.runs import sweep as sweep_module
 from ghgs_lit.runs.run import RunDirectory
 from tests.helpers.jobs import (
     executed,
@@ -82,7 +82,7 @@ def stop_in_third_plan(monkeypatch, number, is_lost):
     OmegaConf restores flags in a ``finally``, where an interruption makes an ``AttributeError``;
     whoever expects one, as ``hasattr`` does, loses the signal.
     """
-    whole = grid.config_hash
+    whole = sweep_module.config_hash
     calls = itertools.count(1)
 
     def interrupted(config):
@@ -95,7 +95,7 @@ def stop_in_third_plan(monkeypatch, number, is_lost):
                 raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
         return whole(config)
 
-    monkeypatch.setattr(grid, "config_hash", interrupted)
+    monkeypatch.setattr(sweep_module, "config_hash", interrupted)
     return calls
 
 

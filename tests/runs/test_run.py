@@ -3,15 +3,14 @@
 import json
 import os
 import signal
-import socket
 import time
 
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.planned import step_seconds
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
+from ghgs_lit.runs.sweep import step_seconds
 from tests.helpers.jobs import (
     hold_run,
     write_finished_run,
@@ -31,13 +30,6 @@ def test_results_that_are_not_whole_are_no_results(tmp_path):
     assert run.metric == 20.0
 
 
-def test_results_of_a_completed_configuration_are_those_of_its_command(tmp_path):
-    """``ghgs adapt`` trains with what it finds in its photographs, beside the keys of the command."""
-    write_finished_run(tmp_path, {"seed": 1}, run={"config_hash": "a"})
-    assert RunDirectory(tmp_path, "a").done
-    assert not RunDirectory(tmp_path, "b").done
-
-
 def test_a_step_is_as_long_as_in_all_sessions_of_finished_runs(tmp_path):
     for name, sessions in (
         ("a", [(100, 30.0), (50, 10.0)]),
@@ -53,40 +45,26 @@ def test_a_step_is_as_long_as_in_all_sessions_of_finished_runs(tmp_path):
     assert step_seconds(tmp_path) == (0.3, 2)
 
 
-def test_results_whose_configuration_was_changed_are_refused(tmp_path):
-    """A changed seed in ``metrics.json`` would move the run to another row of a table."""
+FIGURES = [(f"{part}.0.psnr", value, rf"\.{part}\[0\]\.psnr") for part in ("rows", "summary")
+           for value in (float("nan"), float("inf"), "20", [20])]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "key"), [*FIGURES, ("provenance.config.seed", 2, r": provenance\.config")]
+)
+def test_results_that_were_changed_are_refused(tmp_path, place, value, key):
+    """A changed seed would move the run to another row of a table; figures are finite numbers."""
     write_finished_run(tmp_path, {"seed": 1})
     path = tmp_path / "metrics.json"
-    content = json.loads(path.read_text())
-    content["provenance"]["config"]["seed"] = 2
+    content = part = json.loads(path.read_text())
+    *before, last = (int(key) if key.isdecimal() else key for key in place.split("."))
+    for key_before in before:
+        part = part[key_before]
+    part[last] = value
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"metrics\.json: provenance\.config: expected .* config_hash"):
-        read_results(path)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), "20", [20]])
-@pytest.mark.parametrize("part", ["rows", "summary"])
-def test_figures_that_are_no_finite_numbers_are_refused(tmp_path, part, value):
-    write_finished_run(tmp_path, {"seed": 1})
-    path = tmp_path / "metrics.json"
-    content = json.loads(path.read_text())
-    content[part][0]["psnr"] = value
-    path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=rf"metrics\.json\.{part}\[0\]\.psnr: expected"):
+    with pytest.raises(InputError, match=rf"metrics\.json{key}: expected"):
         read_results(path)
     assert not RunDirectory(tmp_path).done
-
-
-def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):
-    """The half-written file of a killed process is removed by the next one, and is no result."""
-    child = PREPARED.Process(target=os.getpid)
-    child.start()
-    child.join()
-    half = tmp_path / f".metrics.json.{socket.gethostname()}.{child.pid}.tmp"
-    half.write_text("{")
-    assert not RunDirectory(tmp_path).done
-    write_finished_run(tmp_path, {"seed": 1})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.csv", "metrics.json"]
 
 
 def test_a_session_that_was_killed_while_it_was_noted(tmp_path):

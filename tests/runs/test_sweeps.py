@@ -10,16 +10,13 @@ from hydra.core.utils import JobReturn, JobStatus
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import job, planned
-from ghgs_lit.runs.grid import combinations, run_all
-from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.results import read_results
-from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs import job
+from ghgs_lit.runs.results import config_hash, read_results
+from ghgs_lit.runs.sweep import combinations, run_all, time_budget
 from ghgs_lit.training.trainer import TrainerOptions
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
-    hold_run,
     plan_seeds,
     record_execution,
     work_through,
@@ -225,20 +222,6 @@ def test_a_sweep_returns_to_runs_that_others_worked_on(tmp_path):
     assert launched == [["0", "1"], ["0"]]
 
 
-def test_a_directory_of_a_single_run_is_not_shared_either(tmp_path):
-    """Two trainings in one directory would overwrite each other."""
-    ready = PREPARED.Event()
-    holder = PREPARED.Process(target=hold_run, args=(tmp_path, ready))
-    holder.start()
-    try:
-        assert ready.wait(30)
-        with pytest.raises(InputError, match=f"that no process works in; found process {holder.pid} on"):
-            job.train_once(RunDirectory(tmp_path), run_of("train"), record_execution)
-    finally:
-        holder.kill()
-        holder.join()
-
-
 def test_the_command_line_replaces_a_sweeps_own_values():
     """``seed=7`` must replace the three seeds of a named sweep, not add to them."""
     own = {"seed": "1,2,3", "views": "v4"}
@@ -256,7 +239,7 @@ def test_a_sweep_over_all_options_of_a_group(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
 def test_time_budgets(value, seconds):
     """Expected times of a plan depend on both forms that Lightning accepts."""
-    assert planned.time_budget(TrainerOptions(max_time=value)) == seconds
+    assert time_budget(TrainerOptions(max_time=value)) == seconds
 
 
 def composed(*overrides: str):

@@ -6,9 +6,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import run_of
-from ghgs_lit.runs.grid import write_plan
-from ghgs_lit.runs.planned import PlannedRun
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.sweep import PlannedRun, write_plan
 from ghgs_lit.training.loggers import TensorBoardOptions
 
 SHARED = ("experiment=demo", "data.root=a/b", "evaluation.views=[3,4]")

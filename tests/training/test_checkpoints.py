@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import signals
-from ghgs_lit.runs.signals import Interrupted, handlers, interruptible
+from ghgs_lit.runs import processes
+from ghgs_lit.runs.processes import Interrupted, handlers, interruptible
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions, StopAtStep
 from tests.training.test_resume import Cut, fit, rows
 
@@ -229,7 +229,7 @@ def test_other_threads_change_no_handlers():
     def work():
         try:
             with interruptible():
-                signals.handle(signals.interrupt, before)
+                processes.handle(processes.interrupt, before)
         except ValueError as error:
             errors.append(error)
 

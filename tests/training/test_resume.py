@@ -14,7 +14,7 @@ from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import run_of
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.provenance import differences
+from ghgs_lit.runs.results import differences
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
 from ghgs_lit.training.cost import TrainingCost

@@ -30,8 +30,7 @@ from ghgs_lit.config.keys import (
 )
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import read_yaml
-from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.results import METHOD, read_results, validated
+from ghgs_lit.runs.results import METHOD, config_hash, read_results, validated
 from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]

@@ -24,8 +24,7 @@ from ghgs_lit.evaluation.tables import (
 )
 from ghgs_lit.evaluation.tables.runs import encoder_name
 from ghgs_lit.evaluation.tables.writers import escape, prose
-from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.results import read_results, summarize, write_results
+from ghgs_lit.runs.results import config_hash, read_results, summarize, write_results
 from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, other, views
 from tests.helpers.tables import tables_of, write_run
 

@@ -1,0 +1,441 @@
+"""Sweeps (``hydra/sweeper=grid``): the plan of a grid's runs, and the launch of those that are not done."""
+
+import contextlib
+import datetime
+import json
+import logging
+import re
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobReturn, JobStatus, filter_overrides
+from hydra.plugins.launcher import Launcher
+from omegaconf import DictConfig, OmegaConf, open_dict
+from tabulate import tabulate
+
+from ghgs_lit.config.compose import check_ablation, chosen_options, plain, saved_text
+from ghgs_lit.config.defaults import fill
+from ghgs_lit.config.keys import is_hyperparameter, key_of
+from ghgs_lit.config.registry import verb_class
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import require_writable, resolved, write_text_atomically
+from ghgs_lit.parsing import read_yaml
+from ghgs_lit.runs.job import BUSY, check_config, check_launcher
+from ghgs_lit.runs.processes import (
+    Interrupted,
+    interruptible,
+    print_how_to_go_on,
+    queue_again,
+    stop_if_interrupted,
+)
+from ghgs_lit.runs.progress import clock
+from ghgs_lit.runs.results import config_hash, differences
+from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State, runs_in_order
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Train
+    from ghgs_lit.training.trainer import TrainerOptions
+
+log = logging.getLogger(__name__)
+OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
+_POLL = 2.0  # seconds between checks of runs that other processes work on
+#: Words in sbatch's errors, and the keys of the launcher that they are about.
+_SBATCH_KEYS = {
+    "partition": ("partition",),
+    "gres": ("gres", "gpus_per_node", "gpus_per_task"),
+    "memory": ("mem_gb", "mem_per_cpu", "mem_per_gpu"),
+    "feature": ("constraint",),
+    "qos": ("qos",),
+    "account": ("account",),
+    "cpu": ("cpus_per_task", "cpus_per_gpu"),
+    "node": ("exclude", "nodelist", "nodes"),
+    "time": ("timeout_min",),
+}
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run of a sweep.
+
+    Attributes:
+        name: Hash of its configuration.
+        overrides: Of the job, with its directory.
+        shown: Overrides to print.
+        run: Its configuration.
+        directory: Of the run.
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+    shown: tuple[str, ...]
+    run: "Train"
+    directory: RunDirectory
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """Result of the checks of a dry run.
+
+    Attributes:
+        reasons: Why runs would be rejected.
+        notes: What else a user should know.
+    """
+
+    reasons: Sequence[str] = ()
+    notes: Sequence[str] = ()
+
+
+Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
+Rehearse = Callable[[Sequence["Train"]], Rehearsal]
+
+
+def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
+    """Run the grid of a command, or with ``dry_run`` print its plan.
+
+    Args:
+        sweeper: Hydra's, with configuration, launcher and parameters.
+        arguments: Overrides of the command line.
+        rehearse: Checks what runs need, for ``dry_run``.
+
+    Returns:
+        What the jobs returned, in the form that Hydra expects.
+
+    Raises:
+        InputError: A configuration, a directory or the launcher is rejected; with ``dry_run``
+            something is missing.
+        Interrupted: Ctrl-C or SIGTERM; no further run is started.
+    """
+    config = sweeper.config
+    directory = resolved(str(config.hydra.sweep.dir))
+    started: list[PlannedRun] = []
+    try:
+        with interruptible():
+            planned = _plan(sweeper, arguments, directory)
+            _print_differing(planned, directory)
+            if config.get("dry_run"):
+                print_plan(planned, directory, rehearse)
+                return []
+            started = planned
+            write_plan(planned, config, directory)
+            launch = partial(_submit, sweeper.launcher, config.hydra.launcher)
+            returns = run_all(planned, launch, sweeper.max_batch_size)
+    except Interrupted as stop:
+        if not stop.explained:
+            how = "nothing was run; to begin, the same command"
+            if started:
+                done = sum(item.directory.done for item in started)
+                how = f"{done} of {len(started)} runs are done; to go on, the same command with"
+                how += f" hydra.sweep.dir={directory}"
+            print_how_to_go_on(stop, "the sweep", how, queue_again(stop.number))
+        raise
+    metrics = [item.directory.metric for item in planned]
+    shown = ["" if metric is None else f"{metric:.2f}" for metric in metrics]
+    sessions = [str(len(item.directory.sessions())) for item in planned]
+    _print_states(planned, {"PSNR": shown, "sessions": sessions})
+    print(f"wrote {directory}", flush=True)
+    for result in returns:
+        _ = result.return_value  # raises what the job raised
+    return [returns]
+
+
+def combinations(
+    params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
+) -> list[list[str]]:
+    """Overrides of each job; values of the command line replace the sweep's own.
+
+    Args:
+        params: ``hydra.sweeper.params``: values of keys, separated by commas; None: none.
+        arguments: Overrides of the command line.
+        loader: Resolves ``glob(*)`` to the options of a group.
+
+    Returns:
+        A list of overrides for each combination of values.
+    """
+    parser = OverridesParser.create(config_loader=loader)
+    given = parser.parse_overrides(list(arguments))
+    keys = {override.get_key_element() for override in given}
+    own = parser.parse_overrides([f"{k}={v}" for k, v in (params or {}).items() if k not in keys])
+    (batch,) = BasicSweeper.split_arguments([*own, *given], None)
+    return batch
+
+
+def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[PlannedRun]:
+    """The distinct runs of a sweep, checked as far as that takes no time; nothing is written."""
+    config, batch = sweeper.config, sweeper.max_batch_size
+    require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
+    verb = verb_class(sweeper.verb)
+    name = f"basic for ghgs {sweeper.verb}, which is not derived from ghgs train"
+    require(issubclass(verb, verb_class("train")), "hydra/sweeper", name, "grid")
+    loader = sweeper.hydra_context.config_loader
+    combos = combinations(sweeper.params, arguments, loader)
+    planned: dict[str, PlannedRun] = {}
+    for overrides in combos:
+        stop_if_interrupted()
+        cfg = loader.load_sweep_config(config, list(overrides))
+        check_ablation(cfg, cfg.hydra)
+        with open_dict(cfg):
+            cfg.hydra.job.num = len(planned)
+            subdirectory = str(cfg.hydra.sweep.subdir)
+            hydra_node = cfg.pop("hydra")
+        run = verb.of(plain(fill(cfg)))
+        run = run.replace(chosen=chosen_options(run.plain, hydra_node))
+        name = config_hash(run.plain)
+        # The job writes to the planned directory, whatever number a launcher gives it.
+        places = {"dir": str(directory), "subdir": subdirectory}
+        fixed = (f"hydra.sweep.{key}={_quoted(place)}" for key, place in places.items())
+        place = RunDirectory(directory / subdirectory, name)
+        shown = tuple(filter_overrides(overrides))
+        planned.setdefault(name, PlannedRun(name, (*overrides, *fixed), shown, run, place))
+    if len(planned) < len(combos):
+        print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
+    runs = list(planned.values())
+    _check(runs, config, directory)
+    return runs
+
+
+def _quoted(text: str) -> str:
+    """``text`` as a value of an override."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text) + "'"
+
+
+def _check(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
+    """Check launcher and directories, and unless it is a dry run that each run can train."""
+    runs: dict[Path, PlannedRun] = {}
+    for item in planned:  # an impossible launcher is rejected before anything starts
+        check_launcher(item.run, config.hydra.runtime.choices["hydra/launcher"])
+        other = runs.setdefault(item.directory.path, item)
+        shared = f"{item.directory.path} for {' '.join(other.shown)} and {' '.join(item.shown)}"
+        require(other is item, "hydra.sweep.subdir", "a directory for each configuration", shared)
+        if not item.directory.done:
+            item.directory.start(item.run)
+    if not all(item.directory.done for item in planned):
+        require_writable(directory, "hydra.sweep.dir", "the runs")
+    for item in [] if config.get("dry_run") else planned:
+        require(not item.run.overwrite, "overwrite", "false in a sweep, which goes on with its runs", True)
+        check_config(item.run)
+
+
+def _print_differing(planned: Sequence[PlannedRun], directory: Path) -> None:
+    """Print which keys differ if a sweep that none of these runs belongs to is in the directory:
+    someone who means to go on with it has changed a key."""
+    if any(item.directory.swept for item in planned):
+        return
+    others = []
+    for path in sorted(directory.glob(f"*/{SWEPT}")):
+        with contextlib.suppress(InputError, OSError):  # a damaged one is not of this sweep
+            others.append(differences(read_yaml(path.with_name("config.yaml")), planned[0].run.plain))
+    if keys := min(others, key=len, default=[]):
+        shown = ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
+        print(
+            f"none of these runs was begun; {len(others)} others in {directory} differ: {shown}", flush=True
+        )
+
+
+def _shared_overrides(planned: Sequence[PlannedRun]) -> set[str]:
+    return set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
+
+
+def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
+    """Write each run's configuration, by which tables list planned runs, and its overrides that the
+    other runs do not have.
+
+    Args:
+        planned: All runs of the sweep.
+        config: Configuration of the command, for ``multirun.yaml``, which also lists the runs.
+        directory: Of the sweep.
+    """
+    shared = _shared_overrides(planned)
+    titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
+    for item in planned:
+        place = item.directory
+        if not (place.path / "config.yaml").exists():
+            write_text_atomically(place.path / "config.yaml", saved_text(item.run.plain))
+        if place.swept:
+            continue
+        swept = [o for o in item.shown if is_hyperparameter(key_of(o))]
+        swept = [o for o in swept if key_of(o) == "seed" or o not in shared] or [f"run={item.name}"]
+        write_text_atomically(place.path / SWEPT, json.dumps(swept))
+        if place.title in titles:  # of a grid with other settings in the same folder
+            write_text_atomically(place.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
+        titles.add(place.title)
+    names = dict.fromkeys([*(item.directory.path.name for item in planned), *runs_in_order(directory)])
+    runs = OmegaConf.to_yaml({"runs": list(names)})
+    write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config) + runs)
+
+
+def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
+    """Launch runs until each one has finished, here or elsewhere, or failed.
+
+    A job that returns ``BUSY`` (another process works on its run) is launched again once that
+    process has ended.
+
+    Args:
+        planned: All runs of the sweep; those that are done are not launched.
+        launch: Starts jobs, given their overrides and the number of the first.
+        batch: Jobs at once, at least 1; None: all.
+
+    Returns:
+        What the jobs returned, in the order in which they ended.
+    """
+    todo = [item for item in planned if not item.directory.done]
+    print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
+    returns: list[JobReturn] = []
+    while todo:
+        busy = []
+        size = batch or len(todo)
+        for jobs in (todo[first : first + size] for first in range(0, len(todo), size)):
+            results = launch([item.overrides for item in jobs], len(returns))
+            for item, result in zip(jobs, results, strict=True):
+                if result.status == JobStatus.FAILED:
+                    try:
+                        error = result.return_value
+                    except Exception as raised:
+                        error = f"{type(raised).__name__}: {raised}".splitlines()[0]
+                    log.error("failed: %s (%s): %s", item.directory.path, " ".join(item.shown), error)
+                elif result.return_value == BUSY:
+                    busy.append(item)
+                    continue
+                returns.append(result)
+        if todo := busy:
+            print(f"waiting for {', '.join(item.directory.owner for item in todo)}", flush=True)
+        while todo and all(item.directory.state == State.RUNNING for item in todo):
+            time.sleep(_POLL)
+    return returns
+
+
+def _submit(
+    launcher: Launcher, options: DictConfig, jobs: Sequence[Sequence[str]], first: int
+) -> Sequence[JobReturn]:
+    """Launch jobs and wait for them; errors of sbatch become one line with the launcher's key."""
+    if not type(launcher).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
+        return launcher.launch(jobs, first)
+    if type(launcher).__name__ == "SlurmLauncher":
+        _check_accounting()
+    try:
+        return launcher.launch(jobs, first)
+    except (RuntimeError, ValueError) as error:
+        is_rejected = isinstance(error.__cause__, subprocess.CalledProcessError)
+        lines = [line.removeprefix("sbatch: error: ") for line in str(error).splitlines()]
+    found = "; ".join(lines[:2])
+    if not is_rejected:
+        logs = options.submitit_folder.replace("%j", "*")
+        raise InputError(
+            f"hydra.launcher: expected jobs that end with a result; found {found} (logs: {logs})"
+        )
+    about = (keys for word, keys in _SBATCH_KEYS.items() if re.search(rf"\b{word}", found, re.IGNORECASE))
+    key = next((key for key in next(about, ()) if options.get(key) is not None), None)
+    where = "hydra.launcher" if key is None else f"hydra.launcher.{key}={options[key]}"
+    raise InputError(f"{where}: expected what sbatch accepts; found {found}")
+
+
+def _check_accounting() -> None:
+    """Keep submitit from calling ``sacct`` all the time where SLURM has no accounting."""
+    with contextlib.suppress(OSError):
+        answer = subprocess.run(["sacct", "--noheader"], check=False, capture_output=True, text=True)
+        if answer.returncode != 0:
+            from submitit import SlurmJob
+
+            SlurmJob.watcher._make_command = lambda: None
+            message = " ".join(answer.stderr.split()) or "sacct fails"
+            print(f"note: {message}: the sweep waits for jobs that are cancelled, too", flush=True)
+
+
+def step_seconds(directory: Path) -> tuple[float, int] | None:
+    """Mean seconds of a training step of a sweep's finished runs, and their number; None: none has
+    finished."""
+    steps = seconds = count = 0
+    for path in directory.rglob("metrics.json"):
+        sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
+        steps += sum(s["steps"] for s in sessions)
+        seconds += sum(s["seconds"] for s in sessions)
+        count += bool(sessions)
+    return (seconds / steps, count) if steps else None
+
+
+def time_budget(trainer: "TrainerOptions") -> float | None:
+    """Seconds of ``trainer.max_time``, which is ``days:hours:minutes:seconds`` or a mapping; None: no
+    limit."""
+    value = trainer.max_time
+    if isinstance(value, str):
+        value = dict(zip(("days", "hours", "minutes", "seconds"), map(int, value.split(":")), strict=True))
+    return None if value is None else datetime.timedelta(**value).total_seconds()
+
+
+def _print_states(
+    planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]], end: str = ""
+) -> list[State]:
+    """Print a table of the runs and the number of runs in each state."""
+    shared = _shared_overrides(planned)
+    states = [item.directory.state for item in planned]
+    overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
+    table = {"run": [item.name for item in planned], "state": [s.value for s in states], **columns}
+    print(tabulate(table | {"overrides": overrides}, "keys", disable_numparse=True))
+    counts = ", ".join(f"{states.count(state)} {state.value}" for state in State if state in states)
+    print(f"{len(planned)} runs: {counts}{end}")
+    return states
+
+
+def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
+    """Print the runs with their states, the training time of the remaining ones, the output paths
+    and what is missing.
+
+    Args:
+        planned: All runs of the sweep.
+        directory: Of the sweep.
+        rehearse: Checks what the runs need that are not done.
+
+    Raises:
+        InputError: Something is missing.
+    """
+    rehearsal = rehearse([item.run for item in planned if not item.directory.done])
+    measured = step_seconds(directory)
+    budgets, remaining, is_limited = [], [], False
+    for trainer, is_done in ((item.run.trainer, item.directory.done) for item in planned):
+        limit = time_budget(trainer)
+        is_limited |= limit is not None
+        times = [] if limit is None else [limit]
+        if measured and trainer.max_steps > 0:
+            times.append(trainer.max_steps * measured[0])
+        expected = min(times, default=None)
+        budgets.append(f"{trainer.max_steps} steps" if expected is None else clock(expected))
+        if not is_done:
+            remaining.append(expected)
+    states = _print_states(planned, {"trains for": budgets}, "; nothing was run")
+    basis = ["trainer.max_time"] if is_limited else []
+    if measured:
+        basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
+    total = "unknown" if None in remaining else clock(sum(remaining))
+    reason = "; ".join(basis) or "no trainer.max_time, and no step was measured"
+    print(f"expected training time of the remaining runs, one after another: {total} ({reason})")
+    place = f"{directory}/<run>" if len(planned) > 1 else planned[0].directory.path
+    print(f"outputs: {place}/ with {OUTPUTS}", flush=True)
+    for note in rehearsal.notes:
+        print(f"note: {note}")
+    reasons = [*rehearsal.reasons, *_unreadable(planned, states)]
+    for reason in reasons:
+        print(f"would be refused: {reason}", flush=True)
+    count = len(reasons)
+    if count:
+        raise InputError(f"dry_run: expected runs that lack nothing; found {count} missing, as said above")
+
+
+def _unreadable(planned: Sequence[PlannedRun], states: Sequence[State]) -> list[str]:
+    """What is wrong with checkpoints that runs would resume, a line each."""
+    from ghgs_lit.weights.checkpoint import read_checkpoint  # here: it imports PyTorch
+
+    lines = []
+    for item, state in zip(planned, states, strict=True):
+        if state == State.PARTIAL:
+            try:
+                read_checkpoint(item.directory.checkpoint)
+            except (InputError, OSError) as error:
+                lines.append(f"{' '.join(str(error).split())} (without this file the run begins anew)")
+    return lines
