@@ -105,13 +105,6 @@ def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:
     return Rendering(image, ones, ones)
 
 
-def infinitely_steep(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-    """:func:`flat_renderer` with an infinite gradient."""
-    rendering = flat_renderer(gaussians, cameras)
-    zero = (rendering.image - rendering.image.detach()).abs()
-    return Rendering(rendering.image + zero.sqrt(), rendering.alpha, rendering.depth)
-
-
 class _Steps(Dataset):
     def __init__(self, length: int):
         self.length = length

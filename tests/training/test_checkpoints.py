@@ -10,7 +10,6 @@ import lightning.pytorch as L
 import pytest
 import torch
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.runs import processes
 from ghgs_lit.runs.processes import Interrupted, handlers, interruptible
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions, StopAtStep
@@ -51,29 +50,9 @@ def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
     assert calls == ["fsync", "replace", "fsync"]
 
 
-@pytest.mark.parametrize("minutes", [0, -1.0])
-def test_minutes_are_positive(minutes):
-    """An impossible interval is refused with its key."""
-    with pytest.raises(InputError, match="minutes"):
-        CheckpointOptions(filename="last", minutes=minutes)
-
-
-def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):
-    """Its score would keep every later one from being written."""
-    path = tmp_path / "best.ckpt"
-    before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
-    before.dirpath = after.dirpath = str(tmp_path)
-    before.best_model_path, before.best_model_score = str(path), torch.tensor(30.0)
-    before.best_k_models = {str(path): torch.tensor(30.0)}
-    after.load_state_dict(before.state_dict())
-    assert (after.best_model_path, after.best_model_score, after.best_k_models) == ("", None, {})
-    path.touch()
-    after.load_state_dict(before.state_dict())
-    assert (after.best_model_path, after.best_model_score) == (str(path), 30)
-
-
-def test_a_moved_run_knows_its_best_checkpoint(tmp_path, recwarn):
-    """The first, worse validation after a move replaced it. States name files, never folders."""
+def test_the_best_checkpoint_is_found_where_the_run_is(tmp_path, recwarn):
+    """In a folder that was moved; the score of one that is gone keeps no later one from being written.
+    States name files, never folders."""
     old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
     before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
     before.dirpath, after.dirpath = str(old), str(new)
@@ -83,6 +62,8 @@ def test_a_moved_run_knows_its_best_checkpoint(tmp_path, recwarn):
     before.best_k_models = {path: score}
     state = before.state_dict()
     assert str(tmp_path) not in str(state)
+    after.load_state_dict(state)
+    assert (after.best_model_path, after.best_model_score, after.best_k_models) == ("", None, {})
     new.mkdir(parents=True)
     (new / "best.ckpt").touch()
     after.load_state_dict(state)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.plugins.precision import MixedPrecision
-from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
 from ghgs_lit.config import run_of
@@ -17,7 +16,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.metrics.regions import box_of
-from ghgs_lit.training import DivergedError, GHGSModule, Optimization
+from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import CheckpointOptions
 from ghgs_lit.training.trainer import TrainerOptions
 from ghgs_lit.types import DepthMaps, Targets
@@ -30,7 +29,6 @@ from tests.helpers.training import (
     Standin,
     example_batch,
     flat_renderer,
-    infinitely_steep,
     loader,
     module,
     trainer,
@@ -100,49 +98,24 @@ def test_checkpoints_are_plain(tmp_path):
     assert "hyper_parameters" not in content
 
 
-def scaled(folder, scale: float, steps: int = 3, renderer=flat_renderer, **weights):
-    """Train in float16 with a scaled loss, on a CPU;
-    returns the norms before clipping, module and scaler."""
-    scaler = torch.amp.GradScaler("cpu", init_scale=scale)
-    norms = []
-    subject = GHGSModule(
-        Standin(), renderer, losses_of(weights or {"depth": 1.0}), Optimization(lr=0.1, clip=0.5), CONFIG
-    )
-    real = subject.log
-    subject.log = lambda name, value, **o: (
-        norms.append(value.item()) if "norm" in name else None,
-        real(name, value, **o),
-    )
-    trainer(folder, steps=steps, plugins=[MixedPrecision("16-mixed", "cpu", scaler)]).fit(subject, loader(1))
-    return norms, subject, scaler
-
-
 def test_a_scaled_loss_is_unscaled_before_the_gradient_is_clipped(tmp_path):
-    """With 16-mixed the norm that is clipped and logged is that of the loss,
-    not of its multiple."""
-    plain, _, _ = scaled(tmp_path / "a", scale=1.0)
-    many, subject, _ = scaled(tmp_path / "b", scale=4096.0)
-    assert many == pytest.approx(plain, rel=1e-3)
-    assert len(many) == 3
+    """With 16-mixed the norm that is clipped and logged is that of the loss, not of its multiple."""
+
+    class Norms(L.Callback):
+        def on_train_batch_end(self, trainer, *_):
+            norms.append(float(trainer.callback_metrics["train/gradient_norm"]))
+
+    seen = []
+    for scale in (1.0, 4096.0):
+        seen.append(norms := [])
+        scaler = torch.amp.GradScaler("cpu", init_scale=scale)
+        options = Optimization(lr=0.1, clip=0.5)
+        subject = GHGSModule(Standin(), flat_renderer, losses_of({"depth": 1.0}), options, CONFIG)
+        plugins = [MixedPrecision("16-mixed", "cpu", scaler)]
+        trainer(tmp_path, 3, [Norms()], plugins=plugins).fit(subject, loader(1))
+    assert seen[1] == pytest.approx(seen[0], rel=1e-3)
+    assert len(seen[1]) == 3
     assert not subject.optimizers().optimizer.defaults["fused"]
-
-
-def test_a_step_whose_scaled_gradient_overflows_is_skipped(tmp_path):
-    """Overflow is how the scale is found; without a scale it is an error as in float32."""
-    norms, subject, scaler = scaled(tmp_path / "a", scale=2.0**127, steps=2, depth=100.0)
-    assert norms == []
-    assert subject.model.depth.item() == 2.5
-    assert scaler.get_scale() == 2.0**125
-    with pytest.raises(DivergedError, match=r"step 0: expected a finite loss and gradient; .* renderer"):
-        scaled(tmp_path / "b", scale=1.0, renderer=infinitely_steep, render_l1=1.0)
-
-
-@pytest.mark.parametrize(("devices", "processes"), [(1, 1), (2, 2)])
-def test_several_processes_have_all_parameters(devices, processes):
-    """Each clips by the norm of the whole gradient; not every parameter has one in every step."""
-    trainer = TrainerOptions(accelerator="cpu", devices=devices, max_steps=1).build(logger=False)
-    assert trainer.num_devices == processes
-    assert isinstance(trainer.strategy, DDPStrategy) == (processes > 1)
 
 
 def test_tf32_is_for_networks_alone():
@@ -166,6 +139,8 @@ def test_tf32_is_for_networks_alone():
 @pytest.mark.parametrize(
     ("values", "key"),
     [
+        ({"filename": "last", "minutes": 0}, r"callbacks\.checkpoints\.minutes"),
+        ({"filename": "last", "minutes": -1.0}, r"callbacks\.checkpoints\.minutes"),
         ({"lr": 0.0}, r"optimizer\.lr"),
         ({"lr": 1.0, "matrix_scale": 0.0}, r"optimizer\.matrix_scale"),
         ({"lr": 1.0, "betas": [0.9, 1.0]}, r"optimizer\.betas"),
@@ -178,8 +153,9 @@ def test_tf32_is_for_networks_alone():
 )
 def test_impossible_values_name_their_key(values, key):
     """A value that cannot work fails when it is read, with its key."""
+    options = CheckpointOptions if "filename" in values else Optimization
     with pytest.raises(InputError, match=key):
-        Optimization(**values)
+        options(**values)
 
 
 def test_random_numbers_of_a_step_are_those_of_seed_step_and_part(monkeypatch):
@@ -197,24 +173,6 @@ def test_random_numbers_of_a_step_are_those_of_seed_step_and_part(monkeypatch):
     different = [seed(), seed(seed=2), seed(step=8), seed(part=1)]
     assert len(set(different)) == 4
     assert different == [seed(rank=1), seed(seed=2), seed(step=8), seed(part=1)]
-
-
-def test_two_seeds_of_training_differ_and_one_repeats(tmp_path):
-    """Points of the Chamfer loss are drawn at random: whatever the process has drawn before."""
-
-    class Curve(L.Callback):
-        def on_train_batch_end(self, trainer, pl_module, outputs, *_):
-            curve.append(outputs["loss"].item())
-
-    curves = []
-    for seed in (1, 1, 2):
-        curve = []
-        curves.append(curve)
-        losses, config = losses_of({"chamfer": 1.0}, chamfer_points=3), {**CONFIG, "seed": seed}
-        subject = GHGSModule(Standin(), flat_renderer, losses, Optimization(lr=0.05), config)
-        trainer(tmp_path, 2, [Curve()], limit_val_batches=0).fit(subject, loader())
-    assert curves[0] == curves[1]
-    assert all(one != other for one, other in zip(curves[1], curves[2], strict=True))
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):

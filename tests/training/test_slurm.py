@@ -38,6 +38,9 @@ def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
     monkeypatch.setenv("SLURM_STEP_ID", "0")
     with pytest.raises(InputError, match=r"trainer: .*--ntasks-per-node=4"):
         build_trainer(run, tmp_path)
+    monkeypatch.setenv("SLURM_NTASKS", "1")
+    (environment,) = train_verb.environments()  # Lightning's handler would save within a step
+    assert (environment.world_size(), environment.auto_requeue) == (1, False)
 
 
 @pytest.fixture
@@ -116,13 +119,6 @@ def test_only_tasks_of_srun_are_queued_again(monkeypatch, task):
     monkeypatch.setenv("SLURM_STEP_ID", "0")
     monkeypatch.setenv("PATH", "")
     assert not processes.queue_again(signal.SIGUSR1)
-
-
-def test_lightning_queues_nothing_again_itself(task):
-    """Its handler writes a checkpoint within a step."""
-    (environment,) = train_verb.environments()
-    assert environment.world_size() == 1
-    assert environment.auto_requeue is False
 
 
 def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, tmp_path):
