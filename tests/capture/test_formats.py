@@ -83,7 +83,7 @@ def own_json(path):
     return write(path / "cameras.json", json_text(calibrations))
 
 
-QUALISYS = """<camera serial="{name}"><fov_video left="0" top="0" right="{right}" bottom="{bottom}"/>
+QUALISYS = """<camera serial="{name}"><fov_video left="{left}" top="{top}" right="{right}" bottom="{bottom}"/>
 <transform x="{x}" y="{y}" z="{z}" {turn}/>
 <intrinsic focalLengthU="{fx}" focalLengthV="{fy}" centerPointU="{cx}" centerPointV="{cy}"
  radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"
@@ -91,18 +91,19 @@ QUALISYS = """<camera serial="{name}"><fov_video left="0" top="0" right="{right}
 
 
 def qualisys(path):
-    """Millimetres, 1/64 pixels, y up and z backward, as its own program writes them."""
+    """Millimetres, 1/64 pixels, y up and z backward, a part of the sensor, as its program writes them."""
     cameras = ""
+    left, top = 16, 8
     for name, camera in rig().items():
         eye = -1000 * camera["R"].T @ camera["T"]
         turn = np.diag([1, -1, -1]) @ camera["R"]
         lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera["D"], strict=True))
         k = 64 * camera["K"]
         cameras += QUALISYS.format(
-            name=name, right=SIZE[1] - 1, bottom=SIZE[0] - 1,
+            name=name, left=left, top=top, right=left + SIZE[1] - 1, bottom=top + SIZE[0] - 1,
             turn=" ".join(f'r{i + 1}{j + 1}="{turn[i, j]}"' for i in range(3) for j in range(3)),
             **dict(zip("xyz", eye, strict=True)), **lens,
-            fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2],
+            fx=k[0, 0], fy=k[1, 1], cx=k[0, 2] + 64 * left, cy=k[1, 2] + 64 * top,
         )  # fmt: skip
     return write(path / "Calib.qca.txt", f"<calibration><cameras>{cameras}</cameras></calibration>")
 

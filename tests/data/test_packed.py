@@ -146,6 +146,13 @@ def test_a_broken_photograph_is_named_when_it_is_drawn(root):
         photographs.view("s0", 0, 0)
 
 
+def test_depth_maps_that_are_not_packed_are_read_from_the_folder(root):
+    reader = rendered(root).dataset.reader("train")
+    packs = packed.Packs(reader, root / "packed", None, "area", (0, 2), False)
+    assert packs.view("s0", 0, 2, depth=False).depth is None
+    assert packs.view("s0", 0, 2, depth=True) is None
+
+
 def test_packing_can_be_switched_off(root):
     batches(root, gb=0)
     assert not files(root)

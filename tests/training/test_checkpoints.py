@@ -12,7 +12,7 @@ import torch
 
 from ghgs_lit.runs import processes
 from ghgs_lit.runs.processes import Interrupted, handlers, interruptible
-from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions, StopAtStep
+from ghgs_lit.training.checkpoints import AfterSteps, AtomicCheckpointIO, CheckpointOptions, StopAtStep
 from tests.training.test_resume import Cut, fit, rows
 
 
@@ -144,6 +144,18 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
         assert torch.equal(a, b)
     assert first.validations + second.validations == validations
     assert rows(tmp_path / "cut") == rows(folder)
+
+
+def test_nothing_is_saved_between_the_parts_of_a_step(tmp_path):
+    """Their gradients would be lost."""
+
+    class Steps(AfterSteps):
+        def after_step(self, trainer, pl_module):
+            steps.append(trainer.global_step)
+
+    steps = []
+    fit(tmp_path, Cut(), more=[Steps()], accumulate_grad_batches=2, limit_val_batches=0)
+    assert steps == sorted(set(steps))
 
 
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):

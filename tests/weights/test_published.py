@@ -158,7 +158,9 @@ def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
     out = tmp_path / "out.ckpt"
     import_weights(config(), out, vggt, release, dtype)
     half = getattr(torch, dtype)
-    assert model_state(read_checkpoint(out))["encoder.aggregator.camera_token"].dtype == half
+    state = model_state(read_checkpoint(out))
+    assert {state[name].dtype for name in state if name.startswith("encoder.")} == {half}
+    assert {state[name].dtype for name in state if not name.startswith("encoder.")} == {torch.float32}
     model = load_model(out, dtype=half)
     heads = (*model.depth_head.parameters(), *model.gaussian_head.parameters())
     assert {p.dtype for p in model.encoder.parameters()} == {half}

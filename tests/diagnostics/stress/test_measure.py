@@ -34,6 +34,15 @@ def test_a_value_that_vanishes_is_found(family):
     assert measure(hide, family, 3, ["float32"])[0]["failures"] == 3
 
 
+def test_a_value_that_reaches_another_case_is_found():
+    """A mean over cases spreads what is not finite."""
+    stage = STAGES["unit vectors"]
+    mix = dataclasses.replace(
+        stage, run=lambda v: {"unit": stage.run(v)["unit"] + v["vectors"].mean(0)}, gradients=()
+    )
+    assert measure(mix, next(iter(PLANTED)), 3, ["float32"])[0]["failures"] == 3
+
+
 def test_a_run_in_other_processes_has_the_same_rows():
     """Cases depend on stage, family and seed alone."""
     tasks = [("unit vectors", family, 2) for family in ("ordinary", "zero_quaternion")]

@@ -181,7 +181,7 @@ RUNS: dict[str, list[tuple]] = {
         ("full", 23.0, {"seed": 3, "recalibration": neighbors(1), "chosen": chosen("other")}),
     ],
     "training": [
-        ("full", 20.0, {"provenance": {"training": {"steps": 300, "seconds": 61.4, "peak_bytes": 2.5e9}}}),
+        ("full", 20.0, {"provenance": {"training": {"steps": 350, "seconds": 61.4, "peak_bytes": 2.5e9}}}),
         ("neither", 19.0, {"provenance": {"training": {"steps": 350, "seconds": 50.0}}}),
         ("neither", 19.0, {"seed": 2, "provenance": {"training": {"steps": 360}}}),
     ],
