@@ -1,6 +1,6 @@
 """Making of data: people, rigs of cameras, photographs, scans.
 
-A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers data sets that are
+A plug-in of :mod:`ghgs_lit` by the same entry point as a user's: it offers data sets that are
 rendered, and the parts of its bodies.
 """
 

@@ -330,12 +330,8 @@ def _publish(notes: Completeness, phase: str, name: str, workspace: Path) -> Non
 def _map(
     render: Callable[[Path, str], str], folders: list[Path], names: list[str], workers: int | None
 ) -> Iterator[str]:
-    """Results of ``render`` in the order of people, from ``workers`` processes; None: one for each core;
-    0 or 1: only this one.
-
-    Raises:
-        RuntimeError: a process died.
-    """
+    """Results of ``render`` in the order of people, from ``workers`` processes (None: one for each core;
+    0 or 1: only this one)."""
     workers = min(len(names), allowed_cores() if workers is None else workers)
     if workers < 2:
         yield from map(render, folders, names)

@@ -34,7 +34,7 @@ Blocked = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Lights:
-    """What lights are drawn from; ranges are [least, greatest]."""
+    """Ranges [least, greatest] from which lights are sampled."""
 
     count: tuple[int, int] = (2, 4)
     ambient: tuple[float, float] = (0.25, 0.55)  # share of light from all around, 0 to 1
@@ -46,7 +46,7 @@ class Lights:
     elevation: tuple[float, float] = (5.0, 60.0)  # of a light, degrees
     contrast: float = 0.6  # relative variation of the strengths of the lights, 0 to below 1
     brightness: float = 0.4  # mean of a typical subject, 1 for white
-    spread: float = 0.12  # standard deviation of its logarithm, beside that between people
+    spread: float = 0.12  # standard deviation of its logarithm, in addition to that between people
 
     def draw(self, rng: np.random.Generator) -> "LightRig":
         """Draw the lights of one person: about evenly spaced in azimuth.
@@ -125,7 +125,7 @@ class LightRig:
         Args:
             points: [n, 3] float32 of the surface, metres.
             normals: [n, 3] float32 unit vectors.
-            is_blocked: tells which rays hit the subject.
+            is_blocked: which rays hit the subject.
 
         Returns:
             Factors [n, 2] on stored values, on the side of the normals and on the other one.
@@ -146,17 +146,7 @@ class LightRig:
 def _visible(
     points: np.ndarray, normals: np.ndarray, directions: np.ndarray, is_blocked: Blocked
 ) -> np.ndarray:
-    """Find the samples of a light that points of a surface see, on the side that faces them.
-
-    Args:
-        points: [n, 3] float32, metres.
-        normals: [n, 3] float32 unit vectors.
-        directions: [s, 3] float32 unit vectors towards the samples.
-        is_blocked: as in :meth:`LightRig.shade`.
-
-    Returns:
-        [n, s] bool.
-    """
+    """Which samples [n, s] of a light are visible from points of a surface, on the side that faces them."""
     side = np.sign(normals @ directions.T)[..., None]
     origins = points[:, None] + np.float32(_LIFT) * side * normals[:, None]
     rays = np.broadcast_to(directions, origins.shape)

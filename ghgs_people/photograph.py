@@ -111,11 +111,7 @@ class Studio:
             self._light(normals)
 
     def _light(self, normals: np.ndarray) -> None:
-        """Compute the light of all corners, and expose.
-
-        Args:
-            normals: [n, 3] of the vertices; 0 where those of the faces around them cancel.
-        """
+        """Compute the light of all corners, and expose; ``normals`` [n, 3] of vertices may be 0."""
         corners, flat, _ = self._surface
         lost = ~normals.any(1)
         for corner in range(3):
@@ -164,15 +160,7 @@ class Studio:
     def _expose(
         self, matrix: np.ndarray, pose: np.ndarray, image: np.ndarray, alpha: np.ndarray, depth: np.ndarray
     ) -> None:
-        """Photograph the person with one camera.
-
-        Args:
-            matrix: intrinsics [3, 3], pixels.
-            pose: extrinsics [4, 4], world to camera, metres.
-            image: [h, w, 3], filled; black before.
-            alpha: [h, w], filled; 0 before.
-            depth: [h, w], filled, in metres; 0 before.
-        """
+        """Photograph the person with one camera: fills ``image``, ``alpha`` and ``depth`` (metres)."""
         n = self.samples
         knee = 1.0 if self.lights is None else _KNEE
         covered = np.zeros(alpha.shape, bool)

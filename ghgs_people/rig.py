@@ -170,7 +170,7 @@ class Rig:
             person: the placed subject, metres.
             yaws: degrees [positions, 5] of all its views (:meth:`yaws`).
             aspect: width / height of the images.
-            rng: for the rig alone; the same numbers are drawn whatever varies.
+            rng: for the rig alone; the same numbers are sampled whatever varies.
 
         Returns:
             The rig without variation, and the deviations [positions, 5] of its cameras.
@@ -185,7 +185,7 @@ class Rig:
         pitch = deviations[..., 0]
         roll = deviations[..., 1]
         shift = deviations[..., 2:]
-        # drawn last, so that the numbers above do not change
+        # sampled last, so that the numbers above do not change
         higher = rng.uniform(-1, 1, yaws.shape)
         higher[:, :2] = 0
         pitch = v.camera_pitch * pitch + v.between_pitch * higher
@@ -203,19 +203,7 @@ class Rig:
         return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
 
     def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-        """Find what a subject takes up in the image of each camera, at focal length 1.
-
-        Args:
-            person: the placed subject, metres.
-            yaws: degrees of n views.
-            poses: deviations of their cameras.
-
-        Returns:
-            Smallest and largest (x/z, y/z) [n, 2].
-
-        Raises:
-            InputError: a point of the subject is behind a camera.
-        """
+        """Smallest and largest (x/z, y/z) [n, 2] of a placed subject in the images of n cameras."""
         vertices = np.concatenate([part.vertices for part in person.parts])
         low = []
         high = []

@@ -22,7 +22,7 @@ from ghgs_people.figures.mesh import Person, TexturedMesh
 log = logging.getLogger(__name__)
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
-#: Options of map_Kd that say where an image is read, but for those that change nothing.
+#: Options of map_Kd that move or scale an image, except for those without effect.
 _MOVES = r"(-\w+ \S+ )*-(s(?! 1(\.0*)? 1(\.0*)? )|o(?! 0(\.0*)? 0(\.0*)? )|t|clamp on) "
 #: Extensions without which a mesh can be read, though a file may require them.
 _READ_EXTENSIONS = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
@@ -104,7 +104,7 @@ class _Beside(trimesh.resolvers.FilePathResolver):
     moved = ""
 
     def get(self, key: str) -> bytes:
-        """Read a file; one that is named with folders of another machine lies beside the mesh.
+        """Read a file; one that is named with folders of another machine lies next to the mesh.
 
         Args:
             key: its name, as the mesh spells it.
@@ -159,11 +159,7 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
 
 
 def _check_gltf(path: Path, content: bytes) -> None:
-    """Refuse a glTF or GLB file that trimesh would read as another mesh or with other textures.
-
-    Raises:
-        InputError: names what it has, and the cure.
-    """
+    """Reject a glTF or GLB file that trimesh would read as another mesh or with other textures."""
     if content[:4] == b"glTF":  # a GLB file begins with a header of 20 bytes and its JSON
         content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
     tree = json.loads(content)
@@ -197,18 +193,7 @@ def _check_gltf(path: Path, content: bytes) -> None:
 def _part(
     path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray, is_alone: bool
 ) -> TexturedMesh:
-    """Make a textured mesh of one that trimesh has read.
-
-    Args:
-        path: of the file, for messages and for images beside it.
-        name: of the mesh, for messages.
-        mesh: as read, in its own frame.
-        transform: [4, 4] from its frame to the world.
-        is_alone: whether it is the file's only mesh.
-
-    Raises:
-        InputError: texture or texture coordinates are missing, or vertices are bad.
-    """
+    """Textured mesh in the world of one that trimesh has read."""
     texture = _texture(path, getattr(mesh.visual, "material", None), is_alone)
     if texture is None:
         raise InputError(f"{path}: expected a texture for the mesh {name!r}; found none")
@@ -224,19 +209,7 @@ def _part(
 
 
 def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
-    """Make a texture of a material.
-
-    Args:
-        path: of the mesh, for messages and for images beside it.
-        material: as trimesh has read it.
-        is_alone: of the file's only mesh, which may be that of an image beside it.
-
-    Returns:
-        [h, w, 3] uint8; None if the material has none.
-
-    Raises:
-        InputError: its alpha cuts parts away.
-    """
+    """Texture [h, w, 3] uint8 of a material, or None; a file's only mesh may take an image next to it."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     # not from a file: trimesh replaced a missing material
     if image is not None and image.format is None:

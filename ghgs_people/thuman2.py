@@ -36,7 +36,7 @@ def find_fits(source: Path, fits: str | None) -> Path | None:
 
     Args:
         source: folder of the scans.
-        fits: the configured folder; None: one of :data:`FIT_FOLDERS` in or beside ``source``.
+        fits: the configured folder; None: one of :data:`FIT_FOLDERS` in or next to ``source``.
 
     Returns:
         The folder; None if there is none.
@@ -114,32 +114,15 @@ class THuman2Source(ScanSource):
         return float(np.degrees(np.arctan2(forward[0], forward[2])))
 
     def _fit(self, name: str, file: str) -> Path:
-        """A file of a scan's fit.
-
-        Args:
-            name: id of the scan.
-            file: its usual name; another spelling of the letters' case is found, too.
-
-        Raises:
-            InputError: there is no folder of the fit.
-        """
+        """A file of a scan's fit, in any spelling of upper and lower case."""
         folder = find_path(self.fits, name) or self.fits / name
         require_folder(folder, "the scan's SMPL-X fit")
         return find_path(folder, file) or folder / file
 
 
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
-    """Refuse a body outside its scan, as when scale or translation were not applied.
-
-    Args:
-        folder: of the fit, for the message.
-        scan: in its own unit.
-        body: vertices [n, 3] of the fit.
-
-    Raises:
-        InputError: the body leaves the scan's box by more than 0.1 of its height, or is not 0.7 to
-            1.2 times as tall.
-    """
+    """Reject a body that leaves its scan's box by more than 0.1 of its height, or is not 0.7 to 1.2 times as
+    tall, as when scale or translation were not applied."""
     points = np.concatenate([part.vertices for part in scan.parts])
     low = points.min(0)
     high = points.max(0)

@@ -28,7 +28,7 @@ from ghgs_lit.data.imperfections import (
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
 
-# Streams of random numbers beside those of ghgs_lit.data.sampling.
+# Streams of random numbers in addition to those of ghgs_lit.data.sampling.
 _SIZES = 3
 _IMPERFECTIONS = 4
 _CHANCE = 5
@@ -44,16 +44,16 @@ Pixels = Annotated[float, Field(ge=0, le=64)]
 class Augmentation(Options):
     """Variation of training batches; null and 0: none. Pixels are those of the inputs at their
     drawn size. Targets keep their colours and cameras, except that principal points move with cut
-    subjects. Depth maps keep the z-depths in the true cameras: the depth loss asks for the distance
-    of the surface, not for one that compensates the error of a camera."""
+    subjects. Depth maps keep the z-depths in the true cameras: the depth loss compares with the distance
+    of the surface, not with one that compensates the error of a camera."""
 
     group = "augmentation"
 
     sizes: tuple[options.Size, ...] | None = None
     """Sides or [height, width] of the inputs;
-    one is drawn for each step, the same in all processes."""
+    one is sampled for each step, the same in all processes."""
     target_scale: tuple[Positive, Positive] | None = None
-    """[least, greatest] size of the targets over that of the inputs, drawn likewise; never larger
+    """[least, greatest] size of the targets over that of the inputs, sampled likewise; never larger
     than data.target_size, as photographs that are enlarged teach blur."""
     chance: Share = 1.0
     """Share of the steps whose inputs are imperfect in the ways below."""
@@ -112,7 +112,7 @@ class Augmentation(Options):
         Args:
             size: (height, width) of the inputs in pixels without variation.
             target: (height, width) of the targets in pixels without variation,
-                which drawn ones never exceed.
+                which sampled ones never exceed.
             seed: of the run.
             step: of training, the same number in all processes.
 
@@ -159,7 +159,7 @@ class Augmentation(Options):
 
         Args:
             batch: of at least two views.
-            rngs: for each element; each kind of variation has a stream of its own.
+            rngs: for each element; each kind of variation has its own stream.
         """
         streams = [rng.spawn(6) for rng in rngs]
         if self.cut:
@@ -198,18 +198,7 @@ class Augmentation(Options):
         outlines: np.random.Generator,
         behind: np.random.Generator,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Photographs of one element as a segmentation would leave them.
-
-        Args:
-            images: on black, in [0, 1], premultiplied.
-            masks: true on the subject.
-            mattes: share of each pixel that shows the subject, in [0, 1].
-            outlines: where errors of masks are drawn from.
-            behind: where backgrounds are drawn from.
-
-        Returns:
-            Images, masks and mattes of the same shapes.
-        """
+        """Images on black, masks and mattes of one element as a segmentation would leave them."""
         limits = (self.mask_offset, self.mask_ragged, HOLE, self.mask_hole_chance)
         wrong = torch.from_numpy(np.stack([perturb_mask(mask, *limits, outlines) for mask in masks.numpy()]))
         has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)

@@ -144,7 +144,7 @@ def make_loader(batches: Dataset, workers: int, **options: Any) -> DataLoader:
     """
     use_known_start_method()
     with warnings.catch_warnings():
-        # Each loader would warn of more workers than cores, which were asked for.
+        # Each loader would warn of more workers than cores, which were configured.
         warnings.filterwarnings("ignore", "This DataLoader will create")
         return DataLoader(
             batches,

@@ -85,7 +85,7 @@ class PhotographsDataModule(LightningDataModule):
         dataset: options of the data set.
         views: choice of the inputs.
         targets: choice of the targets.
-        seed: of all that is drawn.
+        seed: of all random numbers.
         augmentation: variation of training batches; None: none.
 
     Raises:
@@ -178,13 +178,8 @@ class PhotographsDataModule(LightningDataModule):
         return TrainingBatches(*parts, length, self.trains_on_depths, rank, world)
 
     def _use_packs(self, batches: float, rank: int) -> None:
-        """Let photographs of training come from packed files, where these fit on the disk.
-
-        Args:
-            batches: number of those that are loaded in the whole run; files that are missing are
-                written only where these read more photographs than there are.
-            rank: number of this process; the first one logs where packed files are.
-        """
+        """Read photographs of training from packed files, where these fit on the disk; missing files are
+        written only if the run loads more photographs than there are."""
         data = self.dataset
         photographs = self.photographs("train")
         subjects = self.subjects("train")
@@ -268,13 +263,7 @@ class PhotographsDataModule(LightningDataModule):
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
     ) -> list[Sample]:
-        """Fixed samples, one for each subject.
-
-        Args:
-            subjects: camera positions by name.
-            protocols: choices of targets, which follow one another in each sample.
-            views: number of inputs; None: the view protocol's.
-        """
+        """Fixed samples, one for each subject, with the targets of all protocols one after another."""
         data = self.dataset
         count = self.views.evaluation_count if views is None else views
         possible = [self._check_static(protocol) for protocol in protocols]
@@ -293,7 +282,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def workers(self, batches: float) -> int:
         """Number of loading processes, by :func:`choose_workers` where ``data.workers``
-        does not say it.
+        is ``auto``.
 
         Args:
             batches: number of batches that are loaded; infinite where it is not known.

@@ -74,8 +74,8 @@ class DataOptions(Options):
     """Samples of one step in each process, all in memory at once: at most 1024."""
     class_steps: Count = 1
     """Training batches in a row with equal sizes of photographs and targets, number of views,
-    entry of token_budgets and number of rounds: a GPU plays back what it has recorded of the first
-    two of them."""
+    entry of token_budgets and number of rounds: the CUDA graph that is captured in the first two of
+    them is replayed in the others."""
     steps_per_epoch: Count | None = None
     """Training steps of an epoch; null: whole passes over the subjects, 100 steps or more."""
     cache_images_mb: Amount = 512
@@ -102,7 +102,7 @@ class DataOptions(Options):
         Args:
             views: choice of the inputs.
             targets: choice of the targets.
-            seed: of all that is drawn.
+            seed: of all random numbers.
             augmentation: variation of training batches; None: none.
         """
         from ghgs_lit.data.datamodule import PhotographsDataModule
@@ -140,13 +140,13 @@ class DataOptions(Options):
         self.prepare()
 
     def check_targets(self, targets: TargetProtocol) -> None:
-        """Refuse a target protocol whose views this data set never has.
+        """Reject a target protocol whose views this data set never has.
 
         Args:
             targets: the protocol.
 
         Raises:
-            InputError: it asks for such views.
+            InputError: it requires such views.
         """
         return
 

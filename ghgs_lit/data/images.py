@@ -40,7 +40,7 @@ def read_image(path: Path) -> Image.Image:
     """Decode an image of :data:`FORMATS`.
 
     Args:
-        path: of the file; its content says the format.
+        path: of the file; the format follows from its content.
 
     Raises:
         InputError: it is missing or cannot be decoded.
@@ -69,7 +69,7 @@ def listed_formats() -> Iterator[None]:
 def orientation_of(image: Image.Image, path: Path) -> int:
     """The EXIF orientation, 1 to 8 (CIPA DC-008).
 
-    Any other value, such as 0, says that it is not known: viewers show such images as they are
+    Any other value, such as 0, means unknown: viewers show such images as they are
     stored. A warning where EXIF data is damaged.
 
     Args:
@@ -116,16 +116,8 @@ def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _to_srgb(profile: bytes, mode: str) -> "tuple[str, ImageCms.ImageCmsTransform | None]":
-    """The mode that a profile describes and the transform from it to sRGB,
-    None where it changes nothing.
-
-    Args:
-        profile: ICC profile as it is embedded.
-        mode: Pillow's mode of the image.
-
-    Raises:
-        ValueError: the profile is of other pixels.
-    """
+    """Mode that an ICC profile describes, and the transform to sRGB (None: the identity); ValueError: the
+    profile is of other pixels."""
     from PIL import ImageCms
 
     opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))

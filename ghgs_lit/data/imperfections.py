@@ -39,7 +39,7 @@ def draw_color_gains(
         views: number of cameras V.
         exposure: greatest deviation of a camera in stops, at least 0.
         white_balance: greatest deviation of red and of blue from green in stops, at least 0.
-        rng: where deviations are drawn from.
+        rng: source of the deviations.
 
     Returns:
         Factors [V, 3] above 0.
@@ -57,7 +57,7 @@ def draw_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Floa
     Args:
         views: number of cameras V.
         gamma: greatest natural logarithm of a power, at least 0.
-        rng: where deviations are drawn from.
+        rng: source of the deviations.
     """
     deviation = rng.uniform(-1, 1, views)
     deviation -= deviation.mean()
@@ -97,7 +97,7 @@ def perturb_mask(
         ragged: greatest height of bumps of the outline in pixels, at least 0.
         hole: greatest diameter of a missing round piece, over the subject's height.
         hole_chance: probability of a missing piece, in [0, 1].
-        rng: where errors are drawn from, as many numbers for all limits.
+        rng: source of the errors; as many numbers are sampled for all limits.
 
     Returns:
         Mask [h, w] bool.
@@ -135,7 +135,7 @@ def draw_backgrounds(
         views: number of cameras V.
         height: rows h of a photograph.
         width: columns w of a photograph.
-        rng: where patterns are drawn from.
+        rng: source of the patterns.
 
     Returns:
         Colours [V, 3, h, w] float32 in [0, 1].
@@ -162,7 +162,7 @@ def perturb_cameras(
 ) -> Cameras:
     """Cameras with errors: each is rotated, moved across its axis, and has another focal length.
 
-    A camera's error, drawn up to ``pixels``, is the motion of the corners of its mask's box (the
+    A camera's error, at most ``pixels``, is the motion of the corners of its mask's box (the
     photograph's for an empty mask) at the subject's distance, root mean square. The common error of
     all cameras is removed, because photographs show only differences between cameras.
 
@@ -170,7 +170,7 @@ def perturb_cameras(
         cameras: true cameras [V].
         masks: masks of the subject [V, H, W].
         pixels: greatest error in pixels, above 0.
-        rng: where errors are drawn from.
+        rng: source of the errors.
 
     Returns:
         Cameras [V] of the same sizes and dtypes.
@@ -239,13 +239,7 @@ def _for_corners(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
 def _remove_common_error(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
-    """Intrinsics and extrinsics without the common part of their differences from true cameras.
-
-    Args:
-        cameras: true cameras [V].
-        lens: intrinsics with errors, float64.
-        pose: extrinsics with errors, float64.
-    """
+    """Float64 intrinsics and extrinsics without the common part of their differences from true cameras."""
     true = cameras.extrinsics.double()
     middle = look_at_point(cameras).double()
     motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
@@ -263,8 +257,8 @@ _SHOWN = 0.45, 0.95
 def cut_subjects(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
     """Cut a share of the subjects by the frame's lower edge.
 
-    Half of them are cut in all inputs and targets at about the same height, so that no legs are
-    asked for that no photograph shows; the others in some inputs, at different heights. Photographs
+    Half of them are cut in all inputs and targets at about the same height, so that no target
+    shows legs that no input shows; the others in some inputs, at different heights. Photographs
     are moved down in their frames, and principal points with them.
 
     Args:

@@ -272,15 +272,8 @@ class Layout(Reader):
         return View(image, mask > mask.max() / 2, inverse, *matrices, matte)
 
     def _file(self, name: str, kind: str, position: int, file: str, suffixes: Sequence[str] = ("",)) -> Path:
-        """A file of a position, by any spelling of its name; the usual one where there is none.
-
-        Args:
-            name: of the subject.
-            kind: folder of the layout, such as ``img``.
-            position: on the ring.
-            file: name of the file, without its suffix if ``suffixes`` are given.
-            suffixes: possible suffixes; the first is the usual one.
-        """
+        """A file of a position in any spelling of its name, or else in the usual one; the first suffix is the
+        preferred one."""
         folder = self._folder(name, kind, position)
         return find_path(folder, file, suffixes) or folder / f"{file}{suffixes[0]}"
 

@@ -58,7 +58,7 @@ class Packs:
         views: numbers of the views at each position that are packed.
         depths: whether depth maps are packed.
         writes: whether missing files are written; otherwise only those that exist are read.
-        paths: file of each subject that was asked for; None: it cannot be packed.
+        paths: file of each subject that was read; None: it cannot be packed.
     """
 
     reader: Reader
@@ -122,7 +122,7 @@ class Packs:
         """Write the file of a subject and remove older ones of the same settings."""
         content = {}
         for position, view in itertools.product(self.reader.subjects[name], self.views):
-            with contextlib.suppress(InputError):  # raised when it is drawn
+            with contextlib.suppress(InputError):  # raised when it is sampled
                 stored = self.reader.checked_view(name, position, view, self.depths)
                 content |= _pack_view(position, view, resize_view(stored, self.size, self.resampling))
         try:

@@ -68,16 +68,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """Read a pickle with the admitted names.
-
-    Args:
-        path: of the file, for messages.
-        stream: where the pickle begins.
-        also: harmless replacements for further names.
-
-    Raises:
-        InputError: it is broken, or names anything else.
-    """
+    """Read a pickle with the admitted names and with ``also``, replacements of further ones."""
     try:
         return _Unpickler(stream, also).load()
     except _Refused as error:

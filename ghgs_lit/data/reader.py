@@ -89,8 +89,8 @@ class Reader(ABC):
         return f"{name}, camera {position}, view {view}"
 
     def sources(self, name: str) -> Iterable[Path | str]:
-        """All that a subject's photographs and body depend on: paths of files, and texts that say
-        the options of their decoding. None: not known, and the subject is never packed
+        """All that a subject's photographs and body depend on: paths of files, and texts that
+        name options of their decoding. Empty: not known, and the subject is never packed
         (:mod:`ghgs_lit.data.packed`)."""
         return ()
 

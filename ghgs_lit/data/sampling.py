@@ -68,7 +68,7 @@ class ViewProtocol(Options):
     group = "views"
 
     training_counts: tuple[Several, ...] = Field((3, 4, 5), min_length=1)
-    """Numbers of input views; one of them is drawn for each training step."""
+    """Numbers of input views; one of them is sampled for each training step."""
     evaluation_count: Several = 4
     """Number of input views in evaluation."""
     training: Literal["any", "even", "uneven"] = "any"
@@ -82,7 +82,7 @@ class ViewProtocol(Options):
             available: positions of the subject.
             count: number of inputs.
             ring: number of positions of a full ring.
-            rng: where they are drawn from.
+            rng: source of random numbers.
         """
         if self.training != "any":
             start = int(rng.integers(ring))
@@ -134,7 +134,7 @@ class TargetProtocol(Options):
     """Positions that cameras takes; null: all."""
     per_subject: Count | Literal["all"] = 1
     """Targets of each subject in evaluation, the first ones;
-    all: one beside every input, or every camera."""
+    all: one next to every input, or every camera."""
     training_views: tuple[ViewNumber, ...] = Field((0, 2, 3, 4), min_length=1)
     """Numbers of the views that training draws from, at any position."""
     per_step: Count = 1
@@ -168,7 +168,7 @@ class TargetProtocol(Options):
             available: positions of the subject.
             inputs: positions of the inputs.
             count: number of photographs.
-            rng: where they are drawn from.
+            rng: source of random numbers.
 
         Raises:
             InputError: there are fewer.
@@ -191,10 +191,10 @@ class TargetProtocol(Options):
             available: positions of the subject.
             inputs: positions of the inputs, in their order on the ring.
             ring: number of positions of a full ring.
-            rng: where random targets are drawn from.
+            rng: source of random targets.
 
         Raises:
-            InputError: the subject lacks positions, or more targets are asked for than there are.
+            InputError: the subject lacks positions, or there are fewer targets than configured.
         """
         if self.kind == "cameras":
             return self._cameras(available, inputs)
@@ -283,13 +283,7 @@ class TrainingSampler:
         return range(first, first + self.batch_size)
 
     def _sample(self, step: int, index: int, count: int) -> Sample:
-        """A sample of the run, which takes all subjects in a new random order each epoch.
-
-        Args:
-            step: of training.
-            index: number of the sample in the run.
-            count: number of inputs.
-        """
+        """Sample number ``index`` of the run, which takes all subjects in a new random order each epoch."""
         names = list(self.subjects)
         epoch, place = divmod(index, len(names))
         name = names[np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(names))[place]]
@@ -315,7 +309,7 @@ def evaluation_samples(
         count: number of inputs, above 0.
         protocols: choices of targets.
         ring: number of positions of a full ring.
-        seed: of targets that are drawn.
+        seed: of random targets.
         positions: lists of input positions; evenly spaced if none has ``count``.
 
     Raises:

@@ -80,16 +80,8 @@ def _entry(place: Path | str, content: Any, key: str) -> Any:
 
 
 def _photographs(place: str, entry: Any, cameras: int) -> tuple[PurePosixPath, ...]:
-    """Paths of the photographs of a frame, in the order of the cameras.
-
-    Args:
-        place: of the frame, for messages.
-        entry: of the frame in ``ims``.
-        cameras: number of cameras.
-
-    Raises:
-        InputError: paths are missing, leave the sequence, or have different frame numbers.
-    """
+    """Paths of the photographs of a frame in the order of the cameras; none may leave the sequence, and
+    all have one frame number."""
     names = _entry(place, entry, "ims")
     if len(names) != cameras:
         raise InputError(f"{place}: expected a photograph for each of {cameras} cameras; found {len(names)}")
