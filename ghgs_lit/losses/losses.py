@@ -49,7 +49,7 @@ class Losses(Options):
         """The terms whose weight is above 0, by name.
 
         Raises:
-            InputError: a term is not registered, or lacks a package or weights of its own."""
+            InputError: a term is not registered, or lacks its package or weights."""
         terms: dict[str, Any] = {}
         for name, weight in self.weights:
             term = class_of(TERM, name, f"weights.{name}")

@@ -71,7 +71,7 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
         prediction: its points are those before the Gaussian head's offset, in metres.
         rendering: not used.
         batch: with body vertices in metres.
-        points: how many of each set are matched, drawn at random; None: all.
+        points: how many of each set are matched, sampled at random; None: all.
 
     Returns:
         The mean over the batch, in square metres.
@@ -97,7 +97,7 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
 def _rows_of_gaussians(
     prediction: Prediction, used: Bool[Tensor, "B V H W"]
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]] | None:
-    """Points of the pixels that Gaussians belong to, whose number is known without a wait.
+    """Points of the pixels that Gaussians belong to, whose number needs no device-to-host synchronisation.
 
     Args:
         prediction: each of its valid pixels has a Gaussian; a shape bucket may be filled by Gaussians
@@ -126,7 +126,7 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     Args:
         prediction: depths of each round [B, V, H, W] in metres.
         rendering: not used.
-        batch: with true depths in metres, 0 where they are not known.
+        batch: with true depths in metres, 0 where there are none.
 
     Returns:
         Metres; 0 where no pixel has a true depth.

@@ -47,8 +47,8 @@ def _device_count(accelerator: str) -> int:
 
 
 def settle_rank(trainer: "TrainerOptions") -> int:
-    """Rank of this process among those of its training. What the environment says counts only where
-    a launcher has started several processes; elsewhere it is left over, and is forgotten.
+    """Rank of this process among those of its training. Variables of the environment count only where
+    a launcher has started several processes; elsewhere they are left over, and are removed.
 
     Args:
         trainer: Its options.
@@ -74,8 +74,8 @@ def in_srun() -> bool:
 
 
 def launch() -> str | None:
-    """What the processes share that were started together: the job's step or torchrun's name, and
-    how often it was started again; None: no launcher says."""
+    """Name of all processes that were started together: the job's step or torchrun's name, and how
+    often it was started again; None: there is no launcher."""
     names = {
         "TORCHELASTIC_RUN_ID": ("TORCHELASTIC_RUN_ID", "TORCHELASTIC_RESTART_COUNT"),
         "SLURM_STEP_ID": ("SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_RESTART_COUNT"),
@@ -99,7 +99,7 @@ def is_queued_again() -> bool:
 
 
 def queue_again(number: int) -> bool:
-    """Let SLURM queue the job of a task again that was stopped because its time is up.
+    """Queue the SLURM job of a task again that was stopped because its time is up.
 
     Args:
         number: Signal that stopped it; SIGUSR1 announces the end of a job's time.
@@ -116,13 +116,13 @@ def queue_again(number: int) -> bool:
         return False
 
 
-#: What ``sbatch --signal`` is asked to send before the end of a job's time.
+#: Signals that ``sbatch --signal`` sends before the end of a job's time.
 ANNOUNCED = (signal.SIGUSR1, signal.SIGUSR2)
 STOP = (signal.SIGINT, signal.SIGTERM, *ANNOUNCED)
 
 
 class Interrupted(SystemExit):
-    """This process was asked to stop by a signal; the exit code is 128 + its number.
+    """A signal has stopped this process; the exit code is 128 + its number.
 
     A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and
     starts the next one.
@@ -250,7 +250,7 @@ def print_how_to_go_on(stop: Interrupted, what: str, how: str, is_queued: bool) 
     Args:
         stop: The interruption; it counts as explained from then on.
         what: What was stopped.
-        how: Text that says which command goes on.
+        how: Which command goes on.
         is_queued: Whether SLURM will run it again.
     """
     stop.explained = True

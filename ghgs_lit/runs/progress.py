@@ -20,7 +20,7 @@ def on_terminal() -> bool:
 
 
 class Lines:
-    """Progress lines, appended to a file and printed (not beside a bar).
+    """Progress lines, appended to a file and printed (unless there is a bar).
 
     Args:
         log: file that lines are appended to; None: none.
@@ -42,7 +42,7 @@ class Lines:
         self._next = now + self.every
         return True
 
-    def say(self, text: str) -> None:
+    def write(self, text: str) -> None:
         """Write one line with the time of day.
 
         Args:
@@ -88,5 +88,5 @@ def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
     started = time.monotonic()
     for done, item in enumerate(items):
         if lines.due() and done:
-            lines.say(f"{text}: {done}{total}, {clock(time.monotonic() - started)}")
+            lines.write(f"{text}: {done}{total}, {clock(time.monotonic() - started)}")
         yield item

@@ -1,7 +1,7 @@
 """A run on disk: whose configuration it has, how it goes on, the process that works on it,
 and its sessions.
 
-``run.json`` says that a folder is a run's, and of which configuration; only in such a folder, and
+``run.json`` marks a folder as a run's, with the hash of its configuration; only in such a folder, and
 only by the process that has locked ``.lock``, anything is deleted. A run is done when it has the
 ``metrics.json`` of its configuration, which is written last. ``sessions.jsonl`` has a line for the
 start of each process and one for its end, which a killed process lacks. No file names the folder,
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  #: Value of ``resume``: as the directory stands
 MARKER = "run.json"
-#: What training writes into a run's directory, beside checkpoints of other names and Hydra's logs, and
-#: a new run deletes; other files in these folders are a user's.
+#: What training writes into a run's directory, apart from checkpoints of other names and Hydra's logs,
+#: and a new run deletes; other files in these folders are a user's.
 _FILES = (
     "checkpoints/frozen-*.pt",
     "csv/metrics.csv",
@@ -60,7 +60,7 @@ _FILES = (
 WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Names in the directory
 _CURVES = "tb"  #: Folder of a sweep with TensorBoard's files of its runs
 SESSIONS = "sessions.jsonl"
-PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, beside its runs
+PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, in the sweep's folder
 
 
 class Identity(BaseModel):
@@ -82,7 +82,7 @@ class Identity(BaseModel):
     job: str | None
 
 
-#: File of a run of a grid that says what sets it apart.
+#: File of a run of a grid with the overrides that distinguish it.
 SWEPT = "swept.json"
 
 
@@ -182,7 +182,7 @@ class RunDirectory:
 
     @property
     def swept(self) -> list[str]:
-        """Overrides that set a run of a grid apart from the others; none for a run of its own."""
+        """Overrides that distinguish a run of a grid from the others; none for a single run."""
         path = self.path / SWEPT
         texts = read_json(path) if path.is_file() else []
         fits = isinstance(texts, list) and all(isinstance(text, str) and text.isprintable() for text in texts)
@@ -198,7 +198,7 @@ class RunDirectory:
     @property
     def curves(self) -> Path:
         """Folder of TensorBoard's files, by which TensorBoard names the run: for a run of a grid
-        beside the runs, called :attr:`title`. ``.run`` in it says whose it is."""
+        in the sweep's folder, called :attr:`title`; ``.run`` in it holds the run's id."""
         if not (self.title and (self.path.parent / PLAN).is_file()):
             return self.path / "tensorboard"
         folder = self.path.parent / _CURVES / self.title

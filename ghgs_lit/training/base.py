@@ -48,7 +48,7 @@ class BudgetedModule(L.LightningModule):
         self.ready = time_mark(torch.device("cpu"))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Copy a batch without a wait where its memory is pinned.
+        """Copy a batch without a synchronisation where its memory is pinned.
 
         Args:
             batch: of the data.
@@ -82,24 +82,22 @@ class BudgetedModule(L.LightningModule):
 
     def step_seed(self, batch_idx: int) -> int:
         """Seed of the random numbers of this step: the same after an interruption, and in all
-        processes, so that none waits for one that has drawn more rounds.
+        processes, so that none waits for one that has sampled more rounds.
 
         Args:
-            batch_idx: of Lightning, which tells the parts of an accumulated step apart.
+            batch_idx: of Lightning, which distinguishes the parts of an accumulated step.
 
         Returns:
             A number of 32 bits, of the run's seed, the step and the part."""
         return int(np.random.SeedSequence(self.step_numbers(batch_idx)).generate_state(1)[0])
 
     def step_numbers(self, batch_idx: int) -> list[int]:
-        """Seed of the run, step, and part of an accumulated step, of which all that is drawn in a
-        step is a function."""
+        """Seeds all randomness of the step: seed of the run, step, and part of an accumulated step."""
         part = batch_idx % self.trainer.accumulate_grad_batches
         return [self.config.get("seed", 0), self.global_step, part]
 
     def class_numbers(self, batch_idx: int) -> list[int] | None:
-        """The same for what consecutive batches share, as ``data.class_steps`` says; None: they
-        share nothing."""
+        """The same for what ``data.class_steps`` consecutive batches share; None: they share nothing."""
         steps = (self.config.get("data") or {}).get("class_steps", 1)
         seed, step, part = self.step_numbers(batch_idx)
         return None if steps == 1 else [seed, (step * self.trainer.accumulate_grad_batches + part) // steps]
@@ -155,8 +153,8 @@ class BudgetedModule(L.LightningModule):
     def configure_optimizers(self) -> dict[str, Any]:
         """The optimizer of all weights and its schedule, which follows the used budget."""
         options = getattr(self.model, "options", None)
-        records = getattr(options, "capture", "auto") == "auto"
-        optimizer = self.optimization.optimizer(self, self._scaler is None, records)
+        captures = getattr(options, "capture", "auto") == "auto"
+        optimizer = self.optimization.optimizer(self, self._scaler is None, captures)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 
@@ -176,7 +174,7 @@ class BudgetedModule(L.LightningModule):
         self.on_train_batch_end()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse to resume with Muon from AdamW's state, or the reverse.
+        """Check that Muon does not resume from AdamW's state, or vice versa.
 
         Args:
             checkpoint: of Lightning.

@@ -47,11 +47,11 @@ class RunProgress(Callback):
         step = trainer.global_step
         # Nothing is new between two parts of an accumulated step.
         is_due = trainer.is_global_zero and step > self._written and self._lines.due()
-        if is_due or not self._bar.disable:  # numbers of a step make the host wait for a GPU
+        if is_due or not self._bar.disable:  # numbers of a step synchronise host and GPU
             text = self._text(trainer, pl_module.used_budget)
             self._bar.update(self._task, completed=pl_module.used_budget, description=text)
         if is_due:
-            self._lines.say(text)
+            self._lines.write(text)
             self._written = step
 
     def _text(self, trainer: L.Trainer, used: float) -> str:
@@ -79,7 +79,7 @@ class RunProgress(Callback):
 
 
 class NeighborsAtStart(Callback):
-    """Says in the first step how many tokens take part in the recalibration, how many neighbours
+    """Prints in the first step how many tokens take part in the recalibration, how many neighbours
     they have, and how many of these would be the same in the other setting of
     ``recalibration.neighborhood``."""
 
@@ -110,7 +110,7 @@ class NeighborsAtStart(Callback):
 
 class AveragingOptions(Options):
     """An exponential average of all weights (EMA), those of a loss included: validations measure
-    it, checkpoints hold it beside the weights that are trained, and it is the result of the run."""
+    it, checkpoints hold it in addition to the weights that are trained, and it is the result of the run."""
 
     group = "callbacks.ema"
     decay: Annotated[float, Field(gt=0, lt=1)] = 0.999
@@ -134,5 +134,5 @@ class Averaging(WeightAveraging):
         """Copy the weights to where they will be trained."""
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
-        if self._average_model is not None:  # a count on a GPU would make each step wait
+        if self._average_model is not None:  # a count on a GPU would synchronise each step
             self._average_model.n_averaged = self._average_model.n_averaged.cpu()

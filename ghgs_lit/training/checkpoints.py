@@ -1,4 +1,4 @@
-"""Checkpoints, written atomically, also when a run is killed or asked to stop."""
+"""Checkpoints, written atomically, also when a run is killed or stopped by a signal."""
 
 import os
 import signal
@@ -120,7 +120,7 @@ class CheckpointOptions(Options):
     every_n_train_steps: Index | None = None
     """Steps between two checkpoints."""
     minutes: float | None = Field(None, gt=0, le=1e6)
-    """Minutes between two checkpoints, beside every_n_train_steps."""
+    """Minutes between two checkpoints, in addition to every_n_train_steps."""
 
     def build(self) -> "Checkpoints":
         """The callback."""

@@ -37,10 +37,10 @@ class Step:
 
     Args:
         batch: of this process.
-        seed: of all random numbers that the step draws.
+        seed: of all random numbers of the step.
         budget: which patches the encoder sees (:func:`~ghgs_lit.training.module.drawn_budget`);
             None: as configured.
-        rounds: number of rounds; None: drawn by the seed."""
+        rounds: number of rounds; None: sampled with the seed."""
 
     batch: Batch
     seed: int
@@ -105,7 +105,7 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
         with torch.enable_grad(), watched(module, _STAGES, fault), precision.train_step_context():
             total = module.forward_losses(step)[1]
             slopes = torch.autograd.grad(total * scale, list(trained.values()), allow_unused=True)
-    except Exception:  # a stage may refuse values that are not finite
+    except Exception:  # a stage may reject values that are not finite
         if not fault.text:
             raise
         return fault.text
@@ -131,7 +131,7 @@ class Guard:
         self._steps: list[tuple[Step, Tensor]] = []
 
     def note(self, step: Step, loss: Tensor) -> None:
-        """Store a forward pass of the optimizer's next step; does not wait for the device.
+        """Store a forward pass of the optimizer's next step; does not synchronise with the device.
 
         Args:
             step: its inputs.
@@ -139,7 +139,7 @@ class Guard:
         self._steps.append((step, loss.detach()))
 
     def is_finite(self, trainer: L.Trainer, norm: Tensor) -> tuple[bool, bool]:
-        """Check the next step of the optimizer. A training step waits for the device only here.
+        """Check the next step of the optimizer. A training step synchronises with the device only here.
 
         Args:
             trainer: of the run.

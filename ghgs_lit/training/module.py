@@ -33,25 +33,25 @@ VALIDATED = ("psnr", "psnr_box", "ssim", "lpips", *FURTHER, "psnr_edge")
 
 
 def drawn_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int = 1) -> Choice:
-    """Draw which patches the encoder sees in a training step.
+    """Sample which patches the encoder processes in a training step.
 
     Args:
         budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest
             rectangle that holds the subject (``balanced``); a number: the subject's patches and
-            those at most this many patches away (``fast``). Budgets that are listed twice are drawn
-            twice as often.
+            those at most this many patches away (``fast``). Budgets that are listed twice are
+            sampled twice as often.
         numbers: seed; equal numbers give the same budget.
-        stream: another one draws something else with the same numbers.
+        stream: another one gives other samples for the same numbers.
 
     Returns:
         One of the budgets."""
-    # A separate key: the same numbers seed the other draws of the step.
+    # A separate key: the same numbers seed the other samples of the step.
     generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(stream,)))
     return budgets[int(generator.integers(len(budgets)))]
 
 
 def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
-    """Set which patches the encoder sees while the context lasts.
+    """Set which patches the encoder processes while the context lasts.
 
     Args:
         model: that predicts in the context.
@@ -67,7 +67,7 @@ def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[N
 
     Args:
         model: that predicts in the context.
-        count: the number; None: each prediction draws one.
+        count: the number; None: each prediction samples one.
 
     Returns:
         The context."""
@@ -94,7 +94,7 @@ class GHGSModule(BudgetedModule):
 
     Args:
         model: as of :class:`BudgetedModule`.
-        renderer: draws Gaussians as seen from cameras.
+        renderer: renders Gaussians from cameras.
         losses: gives the weighted total, and each term by name, of a prediction, its rendering and
             the batch. Weights of its own are trained with the model's.
         optimization: as of :class:`BudgetedModule`.

@@ -4,11 +4,11 @@ Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/Kel
 they change all directions of a matrix equally, not only the few that dominate the gradient. Step
 lengths are those of J. Liu et al., "Muon is Scalable for LLM Training", 2025.
 
-``torch.optim.Muon`` takes the same steps, one matrix after the other, in bfloat16, and refuses
+``torch.optim.Muon`` takes the same steps, one matrix after the other, in bfloat16, and rejects
 weights of convolutions. Here these are matrices with a row for each output channel, products are
 float32, and matrices of similar size are multiplied together. Of the 134 matrices of the weights
-that come with the package, PyTorch's takes 61, for which it asks a GPU for 1 403 launches; this
-module asks for 133 for all weights."""
+that come with the package, PyTorch's takes 61, for which it launches 1 403 kernels; this module
+launches 133 for all weights."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, partial
@@ -53,8 +53,8 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     """Replace singular values by values of about 1 (0.7 to 1.2).
 
     Zeros around a matrix change none of its singular vectors, so that small matrices of many sizes
-    are padded and go through the iterations together. A result differs by rounding with the
-    matrices beside it.
+    are padded and go through the iterations together. A result depends, within rounding, on
+    the other matrices.
 
     Args:
         matrices: of any sizes, float32 or wider, all of one type on one device.
@@ -115,7 +115,7 @@ def _packing(shapes: tuple[tuple[int, int], ...], device: torch.device) -> _Pack
         first += places.numel()
         wide = places if shape[0] <= shape[1] else places.mT
         side = max(_power_of_two(wide.shape[0]), LEAST_PADDED)
-        # A CPU minds padding, a GPU the number of products.
+        # On a CPU padding costs time, on a GPU the number of products.
         width = _power_of_two(wide.shape[1]) if device.type == "cpu" else 0
         classes.setdefault((side, width), []).append(wide)
     padded = []
@@ -160,13 +160,13 @@ def _orthogonalized(matrices: Tensor) -> Tensor:
 
 
 def _layout(weight: Tensor) -> torch.memory_format:
-    """How a weight lies in memory."""
+    """Memory layout of a weight."""
     is_last = weight.dim() == 4 and not weight.is_contiguous()
     return torch.channels_last if is_last else torch.contiguous_format
 
 
 def _place(value: Any) -> Any:
-    """Where a tensor lies, which a recording depends on, or any other value."""
+    """The storage of a tensor, on which a captured graph depends, or any other value."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) else value
 
 
@@ -177,15 +177,15 @@ class Muon(torch.optim.AdamW):
         parameters: to be moved.
         matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A
             number, or, as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so
-            that a recorded step follows the schedule.
-        records: whether a GPU's steps are recorded as a CUDA graph.
+            that a captured step follows the schedule.
+        captures: whether a GPU's steps are captured as a CUDA graph.
         **options: of AdamW; weight decay is for both."""
 
     def __init__(
         self,
         parameters: Iterable[nn.Parameter],
         matrix_lr: float | Tensor,
-        records: bool = True,
+        captures: bool = True,
         **options: Any,
     ):
         parameters = list(parameters)
@@ -195,7 +195,7 @@ class Muon(torch.optim.AdamW):
         groups.append({"params": matrices, "orthogonal": True, "lr": matrix_lr})
         super().__init__([group for group in groups if group["params"]], **options)
         on_gpu = any(parameter.is_cuda for parameter in matrices)
-        self.graphs = GraphCache(limit=2) if records and on_gpu else None
+        self.graphs = GraphCache(limit=2) if captures and on_gpu else None
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
@@ -224,7 +224,7 @@ class Muon(torch.optim.AdamW):
         return loss
 
     def _states(self, moved: Sequence[nn.Parameter]) -> list[Tensor]:
-        """All that a step of some parameters writes beside themselves."""
+        """The optimizer's states of some parameters, which a step writes."""
         return [value for parameter in moved for value in self.state.get(parameter, {}).values()]
 
     def _move(self, moved: Sequence[nn.Parameter], gradients: Sequence[Tensor]) -> None:
@@ -259,8 +259,7 @@ class Muon(torch.optim.AdamW):
         torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
         torch._foreach_mul_(steps, group["lr"])
         torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])
-        # One that lies in memory otherwise than its weight would make PyTorch add one
-        # after the other.
+        # Steps with another memory layout than their weights would be added one by one.
         shaped = []
         for step, weight in zip(steps, moved, strict=True):
             shaped.append(step.view_as(weight).contiguous(memory_format=_layout(weight)))

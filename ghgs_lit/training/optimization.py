@@ -25,8 +25,8 @@ def named_weights(module: nn.Module) -> Iterator[tuple[str, nn.Parameter]]:
     """Parameters by the names that configurations and messages use.
 
     Args:
-        module: a model, or a LightningModule, of which parts beside the model (a loss, a renderer)
-            can have weights, too.
+        module: a model, or a LightningModule, in which other parts than the model (a loss, a
+            renderer) can have weights, too.
 
     Returns:
         Names and parameters: those of the model by their names in it, such as
@@ -62,10 +62,10 @@ class Optimization(Options):
     """Steps in a row that are not finite and are skipped before the run stops;
     0: it stops at the first."""
 
-    def optimizer(self, module: nn.Module, fused: bool = True, records: bool = True) -> torch.optim.AdamW:
+    def optimizer(self, module: nn.Module, fused: bool = True, captures: bool = True) -> torch.optim.AdamW:
         """The optimizer of all trained parameters.
 
-        On a GPU it counts steps there (``capturable``), so that its step can be recorded as a CUDA
+        On a GPU it counts steps there (``capturable``), so that its step can be captured as a CUDA
         graph; the learning rates become tensors by :func:`hold_rates`.
 
         Args:
@@ -73,7 +73,7 @@ class Optimization(Options):
                 on the device of the training.
             fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside
                 its step, too late for clipping gradients.
-            records: whether Muon's steps are recorded as a CUDA graph on a GPU.
+            captures: whether Muon's steps are captured as a CUDA graph on a GPU.
 
         Returns:
             AdamW, or Muon where there is a ``matrix_scale``.
@@ -90,7 +90,7 @@ class Optimization(Options):
         options |= {"eps": EPS, "fused": fused, "capturable": on_gpu}
         if self.matrix_scale is None:
             return torch.optim.AdamW(parameters, **options)
-        return Muon(parameters, self.matrix_scale * self.lr, records, **options)
+        return Muon(parameters, self.matrix_scale * self.lr, captures, **options)
 
     def drop_frozen_gradients(self, module: nn.Module, progress: float) -> None:
         """Remove gradients of frozen parameters, so that the optimizer leaves them unchanged, also
@@ -98,8 +98,7 @@ class Optimization(Options):
 
         Args:
             module: that of :meth:`optimizer`.
-            progress: used share of the run's budget in [0, 1];
-                ``freeze_until`` says until which one."""
+            progress: used share of the run's budget in [0, 1]."""
         frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
         if not frozen:
             return
@@ -114,7 +113,7 @@ class Optimization(Options):
             module: that of :meth:`optimizer`.
 
         Returns:
-            The norm before, without dimensions, on the module's device; does not wait for it."""
+            The norm before, without dimensions, on the module's device, without a synchronisation."""
         return nn.utils.clip_grad_norm_(module.parameters(), self.clip, foreach=True)
 
     def factor(self, progress: float) -> float:
@@ -130,7 +129,7 @@ class Optimization(Options):
 
 def hold_rates(optimizer: torch.optim.Optimizer) -> None:
     """Hold learning rates as tensors on a GPU:
-    a recorded step reads what the schedule writes there.
+    a captured step reads what the schedule writes there.
 
     Args:
         optimizer: of :meth:`Optimization.optimizer`; unchanged where it is not ``capturable``."""

@@ -1,5 +1,5 @@
 """The pretext stage: parts of bodies that patches show, a branch that learns them, and a measure of how
-well features tell them."""
+well features distinguish them."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -46,7 +46,7 @@ class BodyParts(Options):
 
 @cache
 def _vertex_parts(vertices: int) -> np.ndarray | None:
-    """Parts of the body model of so many vertices; None: no plug-in knows it."""
+    """Parts of the body model of so many vertices; None: no plug-in has it."""
     for kind in registry.kinds_of(registry.PARTS):
         body = registry.class_of(registry.PARTS, kind, registry.PARTS)
         if body.vertices == vertices:
@@ -63,7 +63,7 @@ def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]
         vertices: of the posed body, all of them.
 
     Raises:
-        InputError: no plug-in knows the parts of a body of so many vertices.
+        InputError: no plug-in has the parts of a body of so many vertices.
     """
     parts = _vertex_parts(len(vertices))
     expected = "those of a body whose parts are known, as of a built-in person (data=synthetic)"
@@ -159,7 +159,7 @@ def cross_entropy(log_shares: Float[Tensor, "N P"], shares: Float[Tensor, "N P"]
 
 
 class PretextModule(BudgetedModule):
-    """Trains a semantic branch to tell body parts.
+    """Trains a semantic branch to distinguish body parts.
 
     Args:
         model: the branch.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def check_start(run: "Train", directory: Path) -> None:
-    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory:
+    """Reject ``init_from`` together with ``resume``, unless the run resumes in its own directory:
     then its configuration still has the ``init_from`` that it began with.
 
     Args:
@@ -78,7 +78,7 @@ def initialize(
         random_frozen: parameters that are not trained may stay as initialised.
 
     Returns:
-        A line for each tensor, which says ``loaded``, ``wrong shape`` or ``missing`` (both stay as
+        A line for each tensor: ``loaded``, ``wrong shape`` or ``missing`` (both stay as
         initialised) or ``ignored`` (not in the model).
 
     Raises:

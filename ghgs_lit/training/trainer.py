@@ -78,13 +78,13 @@ class TrainerOptions(Options):
         """The Trainer.
 
         Args:
-            **arguments: of Lightning's Trainer, beside the options.
+            **arguments: further ones of Lightning's Trainer.
 
         Returns:
             A Trainer that counts validations in steps and has no limit of epochs.
 
         Raises:
-            InputError: Lightning refuses the options."""
+            InputError: Lightning rejects the options."""
         options = dict(self)
         options["val_check_interval"] *= self.accumulate_grad_batches  # Lightning counts batches
         if self.precision == "tf32":

@@ -34,7 +34,7 @@ class PicturesOptions(Options):
     subjects: Index = 2
     """Number of subjects; 0: none."""
     token: tuple[Index, Index, Index] | None = None
-    """Whose attention is drawn: view, row and column on the grid of tokens of padded photographs;
+    """Whose attention is shown: view, row and column on the grid of tokens of padded photographs;
     null: the middle of the subject in its first view."""
 
     def build(self) -> "Pictures":
@@ -49,7 +49,7 @@ class Pictures(Callback):
     predicted points and the body's vertices.
 
     Args:
-        options: whom to draw."""
+        options: which subjects to draw."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options

@@ -80,14 +80,6 @@ def _reference_chamfer(a: torch.Tensor, b: torch.Tensor) -> float:
     return squared.min(1).mean() + squared.min(0).mean()
 
 
-def test_nearest_neighbours_are_exact():
-    """The search for nearest neighbours gives SciPy's result."""
-    g = torch.Generator().manual_seed(0)
-    a, b = torch.rand(300, 3, generator=g), torch.rand(200, 3, generator=g)
-    expected = torch.from_numpy(cdist(a.double(), b.double()).argmin(1))
-    assert torch.equal(nearest(a, b), expected)
-
-
 @pytest.mark.parametrize("away", [0.0, 500.0])
 def test_products_find_the_nearest_as_a_tree_does(monkeypatch, away):
     """Also where blocks are small, far from the origin, and for one reference or no query."""
