@@ -184,37 +184,31 @@ Path("cameras.json").write_text(json.dumps({"cameras": cameras}))
 END"""
 # A document, and the commands that make what its reader has.
 BEFORE = {
-    "docs/add_a_data_set.md": (*_RENDERED, _PHOTOGRAPHS),
-    "docs/benchmark.md": _CHECKPOINTS,
     "docs/data.md": (
         f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW}",
         _SCANS.format("THuman2.0_Release"),
+        _PHOTOGRAPHS,
     ),
-    "docs/encoder.md": _CHECKPOINTS,
     "docs/evidence/benchmark.md": _RENDERED,
     "docs/evidence/photographs.md": _RENDERED,
     "docs/evidence/rounds.md": _RENDERED,
-    "docs/first_week.md": (
+    "docs/extend.md": (*_RENDERED, _ABLATION),
+    "docs/method.md": _RENDERED,
+    "docs/performance.md": _CHECKPOINTS,
+    "docs/reproduce.md": (
         _SCANS.format("THuman2.0_Release"),
         f"python scripts/miniature.py data=zju_mocap data.root=zju_mocap {FEW}",
         f"python scripts/miniature.py data=humman data.root=humman {FEW}",
         "cp humman_body_models/smpl/SMPL_NEUTRAL.pkl .",
         _SWEEP,
     ),
-    "docs/outputs.md": _CHECKPOINTS,
     "docs/photographs.md": (
         f"{_RUN} hydra.run.dir=runs/mine",
         f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW} --size 112",
         _CAPTURE,
     ),
-    "docs/rounds.md": _RENDERED,
-    "docs/sweeps.md": (_SWEEP, _ABLATION),
     "docs/tables.md": (_SWEEP,),
-    "docs/training.md": (
-        f"{_RUN} hydra.run.dir=runs/before",
-        f"python scripts/miniature.py data=thuman2 data.root=thuman2 {FEW}",
-        *_RENDERED,
-    ),
+    "docs/training.md": (f"{_RUN} hydra.run.dir=runs/before", _SWEEP),
 }  # fmt: skip
 # Names that Python blocks of a document take as given.
 GIVEN = {
@@ -232,8 +226,8 @@ FAST = {
     r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|"
     r"ghgs train .*trainer=gpu|ghgs predict|#python",
     "docs/rasterizer.md": r"#python",
-    "docs/sweeps.md": r".*dry_run=true",
     "docs/tables.md": r"ghgs table",
+    "docs/training.md": r".*dry_run=true",
 }
 
 

@@ -19,7 +19,7 @@ from tests.helpers.scenes import make_batch
 from tests.helpers.weights import PUBLISHED
 from tests.helpers.weights import config as imported_config
 
-#: What a new model of the paper does, beside what the release does (docs/weights.md).
+#: What a new model of the paper does, beside what the release does (docs/reproduce.md).
 QUIRKS = {
     ("model", "pad"): ("none", "multiple"),
     ("unprojection", "tokens"): ("subject", "release"),

@@ -8,7 +8,7 @@ from ghgs_lit.method.heads.attributes import OPACITY_START, SCALE_CAP
 
 
 def test_the_page_prints_the_figures_of_the_code():
-    text = (Path(__file__).parents[1] / "docs" / "paper.md").read_text()
+    text = (Path(__file__).parents[1] / "docs" / "method.md").read_text()
     run = run_of("train", ["experiment=thuman2", "data.root=x"]).plain
     head, recalibration, optimizer = run["gaussian_head"], run["recalibration"], run["optimizer"]
     attributes = head["attributes"]
