@@ -4,12 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
 from omegaconf import OmegaConf
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.encoder import VGGTEncoder
-from ghgs_lit.method.encoder.block import rotary_tables, rotate
+from ghgs_lit.method.encoder.block import rotary_tables
 from ghgs_lit.method.plan.patches import KeptPatches
 from tests.helpers.configs import composed
 from tests.helpers.encoders import make_encoder
@@ -78,19 +77,6 @@ def test_any_patch_size_and_shape(patch_size, mask_input):
     assert torch.equal(seen, tokens.latent[0]) is not mask_input
 
 
-def test_batch_elements_are_independent():
-    """A result must not depend on the other subjects of its batch."""
-    encoder = _encoder().double()
-    images, masks = _views(2, 3, 28, 42)
-    images = images.double()
-    both = encoder(images, masks)
-    for b in range(2):
-        one = encoder(images[b : b + 1], masks[b : b + 1])
-        part = slice(b * 3 * 6, (b + 1) * 3 * 6)
-        for x, y in zip(one.latent, both.latent, strict=True):
-            torch.testing.assert_close(x, y[part], rtol=1e-9, atol=1e-9)
-
-
 def test_images_that_are_wider_than_the_weights_are_named():
     """They would end in a convolution of one of the heads."""
     images, masks = _views(1, 2, 28, 28)
@@ -98,48 +84,11 @@ def test_images_that_are_wider_than_the_weights_are_named():
         _encoder()(images.double(), masks)
 
 
-def test_only_the_first_view_is_special():
-    """The order of the later views must not change their tokens."""
-    encoder = _encoder().double()
-    images, masks = _views(1, 3, 28, 42)
-    images = images.double()
-    latent = encoder(images, masks).latent[1].view(3, 6, -1)
-    tail = encoder(images[:, [0, 2, 1]], masks[:, [0, 2, 1]]).latent[1].view(3, 6, -1)
-    torch.testing.assert_close(tail, latent[[0, 2, 1]], rtol=1e-9, atol=1e-9)
-    head = encoder(images[:, [1, 0, 2]], masks[:, [1, 0, 2]]).latent[1].view(3, 6, -1)
-    assert (head - latent[[1, 0, 2]]).abs().max() > 0.05
-
-
-def test_one_view_sees_only_itself():
-    """Frame attention must stay within a view; global attention must not."""
-    encoder = _encoder().double()
-    images, masks = _views(1, 3, 28, 28)
-    images = images.double()
-    alone = encoder(images[:, :1], masks[:, :1]).latent[0]
-    among = encoder(images, masks).latent[0][:4]
-    frame, across = slice(0, 32), slice(32, 64)
-    torch.testing.assert_close(alone[:, frame], among[:, frame], rtol=1e-9, atol=1e-9)
-    assert (alone[:, across] - among[:, across]).abs().max() > 0.01
-
-
 def test_semantic_features_carry_no_gradient():
     """Semantic features weight the attention; they are not trained through it."""
     tokens = _encoder()(*_views(1, 2, 28, 28))
     assert not tokens.semantic.requires_grad
     assert tokens.latent[0].requires_grad
-
-
-def test_checkpointing_changes_nothing():
-    """Saving memory must not change a gradient."""
-    gradients = []
-    for checkpointing in (False, True):
-        encoder = _encoder(
-            checkpointing=checkpointing, vit={"kind": "dinov2", "depth": 1, "heads": 2}, image_size=28
-        )
-        sum(latent.square().mean() for latent in encoder(*_views(1, 2, 28, 28)).latent).backward()
-        gradients.append([p.grad for p in encoder.parameters() if p.requires_grad])
-    for kept, recomputed in zip(*gradients, strict=True):
-        torch.testing.assert_close(kept, recomputed)
 
 
 @pytest.mark.parametrize(("trainable", "pairs"), [("none", 0), ("last_1", 1), ("all", 2)])
@@ -166,20 +115,6 @@ def test_low_precision_stays_near_float32():
     assert (low - exact).square().mean().sqrt() < 0.02 * exact.std()
 
 
-def test_rotation_depends_on_differences_of_positions():
-    """Rotary positions must be relative."""
-    g = torch.Generator().manual_seed(0)
-    q, k = torch.randn(2, 1, 16, generator=g, dtype=torch.float64)
-
-    def score(a, b):
-        turned = rotate(torch.cat((q, k)), rotary_tables(torch.tensor([a, b]), 16, q))
-        return turned[0] @ turned[1]
-
-    torch.testing.assert_close(score((3, 5), (1, 9)), score((13, 25), (11, 29)), rtol=1e-5, atol=1e-5)
-    assert (score((3, 5), (1, 9)) - score((3, 5), (9, 1))).abs() > 1e-2
-    torch.testing.assert_close(score((0, 0), (0, 0)), (q * k).sum(), rtol=1e-12, atol=1e-12)
-
-
 def test_angles_are_float32_whatever_the_tokens():
     """Angles in half precision would shift positions."""
     kept = KeptPatches(torch.ones(1, 1, 37, 37, dtype=torch.bool), torch.device("cpu"))
@@ -192,24 +127,6 @@ def test_angles_are_float32_whatever_the_tokens():
         assert torch.equal(tables.sine, exact.sine)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(rotary_tables(positions, 64, torch.zeros(1)).sine, exact.sine)
-
-
-def test_half_precision_weights_run():
-    """An encoder with bfloat16 weights must give finite tokens in bfloat16."""
-    encoder = _encoder().bfloat16()
-    tokens = encoder(*_views(1, 2, 28, 28))
-    assert tokens.latent[0].dtype == torch.bfloat16
-    assert tokens.latent[0].isfinite().all()
-
-
-def test_weights_can_be_assigned_to_a_model_without_storage():
-    """Checkpoints are loaded without a second copy of the weights."""
-    encoder = _encoder()
-    with torch.device("meta"):
-        empty = make_encoder(**SMALL)
-    empty.load_state_dict(encoder.state_dict(), assign=True)
-    images, masks = _views(1, 2, 28, 28)
-    assert torch.equal(empty(images, masks).latent[1], encoder(images, masks).latent[1])
 
 
 @pytest.mark.parametrize(
@@ -232,18 +149,6 @@ def test_special_tokens_are_drawn_near_zero(vit):
 def test_normalisation_is_no_part_of_a_checkpoint():
     """Published weights have no such tensors."""
     assert all(key.startswith("aggregator.") for key in _encoder().state_dict())
-
-
-def test_stored_positions_serve_any_grid():
-    """Other image sizes must resample the stored positions as published."""
-    encoder = _encoder(vit={"kind": "dinov2", "depth": 1, "heads": 2}, image_size=56)
-    vit = encoder.aggregator.patch_embed
-    assert vit.positions(4, 4, torch.float32) is vit.pos_embed
-    resampled = vit.positions(6, 5, torch.float32)
-    grid = vit.pos_embed[:, 1:].unflatten(1, (4, 4)).permute(0, 3, 1, 2)
-    expected = F.interpolate(grid, (6, 5), mode="bicubic", antialias=True).flatten(2).mT
-    assert torch.equal(resampled[:, 1:], expected)
-    assert torch.equal(resampled[:, :1], vit.pos_embed[:, :1])
 
 
 @pytest.mark.parametrize(

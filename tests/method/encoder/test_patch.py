@@ -7,7 +7,6 @@ from ghgs_lit.method.encoder.vit import ConvStem
 from ghgs_lit.method.plan.patches import KeptPatches
 
 GRID = (2, 2, 9, 11)
-PLACES = [[(0, 0, 4, 5)], [(0, 0, 3, 4), (1, 1, 5, 2)], [(0, 1, 0, 10), (1, 0, 8, 0)]]
 
 
 def kept(*places: tuple[int, int, int, int]) -> KeptPatches:

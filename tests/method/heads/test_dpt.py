@@ -36,17 +36,6 @@ def test_any_patch_size_and_grid(patch_size, grid):
     assert raw.isfinite().all()
 
 
-def test_images_are_independent():
-    """An image must not see another one of its batch."""
-    head = _head().double()
-    tokens = _tokens(v=5, dtype=torch.float64)
-    together = head(tokens)
-    kept = tokens.image == 3
-    one = tokens.select(kept)
-    one = dataclasses.replace(one, image=torch.zeros_like(one.image), grid=(1, 1, 3, 2))
-    torch.testing.assert_close(head(one), together[3:4], rtol=1e-12, atol=1e-12)
-
-
 def test_tokens_that_were_not_kept_are_blank():
     """Missing tokens must be 0, not the bias of a projection."""
     head = _head()
@@ -183,18 +172,6 @@ def test_positions_made_for_inference_serve_training():
     torch.testing.assert_close(found, expected)
     found.sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in head.parameters())
-
-
-def test_positions_are_centred():
-    """Position embeddings must be symmetric about the middle of the image."""
-    e = add_positions_(torch.zeros(1, 8, 4, 6, dtype=torch.float64), 1.5)[0]
-    sine = [0, 1, 4, 5]
-    cosine = [2, 3, 6, 7]
-    flipped = e.flip(1, 2)
-    torch.testing.assert_close(flipped[sine], -e[sine])
-    torch.testing.assert_close(flipped[cosine], e[cosine])
-    assert torch.equal(e[0], e[0, :1].expand(4, -1))
-    assert torch.equal(e[4], e[4, :, :1].expand(-1, 6))
 
 
 def test_unit_of_zero_is_zero_with_a_finite_gradient():
