@@ -77,12 +77,10 @@ class Hypothesis:
         Raises:
             InputError: a photograph has another aspect ratio than its calibration.
         """
-        photographs = []
-        for view in self.views:
-            matte = view.mask * np.uint8(255)
-            upright = folder.photograph(view.name, view.camera, view.pixels, matte, view.convention)
-            photographs.append(upright)
-        return photographs
+        return [
+            folder.photograph(view.name, view.camera, view.pixels, view.mask * np.uint8(255), view.convention)
+            for view in self.views
+        ]
 
     def scored(self, folder: CaptureFolder) -> "Hypothesis":
         """Measure the :attr:`shares`.

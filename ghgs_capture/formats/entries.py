@@ -37,10 +37,14 @@ FISHEYE = "k1 k2 k3 k4"
 # Camera models that are read: those of a pinhole, with OpenCV's distortion,
 # and of OpenCV's fisheye.
 _PINHOLES = ("pinhole", "perspective", "simplepinhole", "none")
-_BROWN = ("opencv", "radial", "simpleradial", "fullopencv", "brown", "brownconrady", "radtan", "standard")
-_BROWN += ("plumbbob", "rationalpolynomial", "radialtangential")
-_FISHEYES = ("opencvfisheye", "simpleradialfisheye", "radialfisheye", "fisheye", "equidistant")
-_FISHEYES += ("kannalabrandt", "kannalabrandt4", "kb4")
+_BROWN = (
+    *("opencv", "radial", "simpleradial", "fullopencv", "brown", "brownconrady", "radtan", "standard"),
+    *("plumbbob", "rationalpolynomial", "radialtangential"),
+)
+_FISHEYES = (
+    *("opencvfisheye", "simpleradialfisheye", "radialfisheye", "fisheye", "equidistant"),
+    *("kannalabrandt", "kannalabrandt4", "kb4"),
+)
 # Entries about a lens, as :func:`plain` spells them, and models that such entries may name.
 _KINDS = "fisheye|omni|spheric|equirect|latlong|theta|panoram|orthogr|cylind|catadiop|stereograph"
 _LENS = re.compile(f"(?<!un)dist(?!ance)|lens|radial|tangent|model|^k$|^[kps][0-9]$|^xi$|{_KINDS}")
@@ -208,7 +212,8 @@ class Entries:
         beyond = [name for name, number in single.items() if number and name not in order.split()]
         require(not beyond, self.origin, f"distortion {order}", beyond)
         if listed is None:
-            return coefficients(single, order)
+            values = np.array([single.get(name, 0.0) for name in order.split()])
+            return values if values.any() else np.zeros(0)
         listed = listed.ravel()
         known = dict(zip(order.split(), listed, strict=False))
         same = all(known.get(name, 0.0) == number for name, number in single.items())
@@ -233,20 +238,6 @@ class Entries:
         )
         require(not lens, self.origin, expected, lens)
         return tuple(left)
-
-
-def coefficients(numbers: Mapping[str, float], names: str) -> np.ndarray:
-    """Distortion coefficients in an order.
-
-    Args:
-        numbers: coefficients by name; those that are missing are 0.
-        names: their order, with spaces between them.
-
-    Returns:
-        [n] float64; none if all are 0.
-    """
-    values = np.array([numbers.get(name, 0.0) for name in names.split()])
-    return values if values.any() else np.zeros(0)
 
 
 def _bends(key: str, value: Any) -> bool:

@@ -1,21 +1,17 @@
 """``ghgs adapt``: weights for one capture, from its own instants."""
 
-import contextlib
 import json
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ghgs_capture.capture import Capture
-from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.learning import LISTING, agrees, splits_of, write_instant
 from ghgs_capture.prediction import without_tones
 from ghgs_capture.rig import spread
 from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.photographs import capture_folder
-from ghgs_capture.verbs.predict import mended_by, shared_by
+from ghgs_capture.verbs.predict import captures_of, mended_by, shared_by
 from ghgs_lit.cli.inputs import (
     build_data,
     build_renderer,
@@ -28,7 +24,7 @@ from ghgs_lit.cli.runtime import announce, files_to_write, output_dir
 from ghgs_lit.cli.train import run_job, train
 from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.options import PathText
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.files import write_text_atomically
@@ -121,24 +117,16 @@ def prepare_instants(run: Adapt) -> None:
     tones, backgrounds, rig, _ = shared_by(folder, model, size, refining, build_renderer(run, device))
     names = spread(folder.instants, _INSTANTS)
     used = []
-    for given in _whole(folder, names, run.data.cameras):
+    for given in captures_of(folder, names):
+        if {photograph.name for photograph in given.photographs} != set(run.data.cameras):
+            print(f"instant {given.name} is not learned from: its cameras are not those of the first")
+            continue
         capture = without_tones(mended_by(backgrounds, given), tones)
         if agrees(capture):
             write_instant(rig.applied(capture) if rig else capture, root, size)
             used.append(given.name)
     print(f"{len(used)} of {len(names)} instants have masks that agree, and are learned from", flush=True)
     write_text_atomically(root / LISTING, json.dumps(splits_of(used)))
-
-
-def _whole(folder: CaptureFolder, names: Sequence[str], cameras: Sequence[str]) -> Iterator[Capture]:
-    """Captures of instants with a photograph of every camera; a line for each of the others."""
-    for name in names:
-        with contextlib.suppress(InputError):
-            capture = Capture(name, folder.photographs(name))
-            if {photograph.name for photograph in capture.photographs} == set(cameras):
-                yield capture
-                continue
-        print(f"instant {name} is not learned from: a photograph or mask is missing", flush=True)
 
 
 def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:

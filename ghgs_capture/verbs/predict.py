@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -256,13 +256,14 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
     return capture
 
 
-def captures_of(folder: CaptureFolder) -> Iterator[Capture]:
-    """Read the instants of a folder one by one; the next one is decoded meanwhile.
+def captures_of(folder: CaptureFolder, names: Sequence[str] | None = None) -> Iterator[Capture]:
+    """Read instants of a folder one by one; the next one is decoded meanwhile.
 
     Of several instants, those that cannot be read are left out with a message.
 
     Args:
         folder: of one instant or several.
+        names: of the instants; None: all.
 
     Yields:
         The capture of each instant.
@@ -270,7 +271,8 @@ def captures_of(folder: CaptureFolder) -> Iterator[Capture]:
     Raises:
         InputError: the only instant cannot be read.
     """
-    names = folder.instants
+    names = folder.instants if names is None else names
+    several = len(folder.instants) > 1
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])
         for name, after in zip(names, [*names[1:], None], strict=True):
@@ -279,14 +281,14 @@ def captures_of(folder: CaptureFolder) -> Iterator[Capture]:
             try:
                 photographs = following.result()
             except InputError as error:
-                if len(names) == 1:
+                if not several:
                     raise
                 print(f"instant {name} is left out: {error}", flush=True)
             if after is not None:
                 following = pool.submit(folder.photographs, after)
             if not photographs:
                 continue
-            for camera, why in missing.items() if len(names) > 1 else ():
+            for camera, why in missing.items() if several else ():
                 print(f"instant {name} is without {camera}: {why}", flush=True)
             yield Capture(name, photographs)
 

@@ -4,8 +4,7 @@ A few steps suffice, and every change is bounded, so that what no photograph sho
 predicted. Inputs that are reproduced say nothing about other views (wrong geometry reproduces them,
 too), so :meth:`Refinement.report` holds one out and predicts again from the others."""
 
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -175,28 +174,11 @@ class Refinement:
         """
         if self.detail:
             require(gaussians.pixel is not None, "refine", "Gaussians of the inputs' pixels", "others")
-        refined = deque(self.states(gaussians, batch), maxlen=1).pop()
-        return self._detailed(refined, batch) if self.detail else refined
-
-    def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
-        """The Gaussians before the first step and after each, without the detail of the end.
-
-        Args:
-            gaussians: predicted from ``batch``.
-            batch: whose photographs they get nearer to.
-
-        Yields:
-            Gaussians without a gradient, ``steps`` + 1 times.
-
-        Raises:
-            InputError: they do not belong to pixels of ``batch``.
-        """
         seen = seen_by(batch)
         search = Descent(gaussians, batch, self.changes)
-        yield gaussians.detach()
         for _ in range(self.steps):
             search.step(self.renderer, seen)
-            yield search.gaussians
+        return self._detailed(search.gaussians, batch) if self.detail else search.gaussians
 
     def report(
         self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]

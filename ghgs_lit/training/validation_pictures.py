@@ -16,8 +16,7 @@ from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.method.recalibration.inspection import Call, attention_of, seen_calls
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
-from ghgs_lit.visualization.clouds import clouds
-from ghgs_lit.visualization.pictures import save_png, sheet
+from ghgs_lit.visualization.pictures import clouds, save_png, sheet
 
 #: TensorBoard's view of clouds: points of two centimetres through a perspective camera.
 CLOUD_VIEW = {

@@ -1,20 +1,26 @@
-"""Photographs, renders, errors and depths side by side, as pictures [h, w, 3] RGB uint8."""
+"""Photographs, renders, errors and depths side by side, as pictures [h, w, 3] RGB uint8, and coloured
+point clouds for a viewer in 3D."""
 
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ghgs_lit.files import write_atomically
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Prediction
 
 _LETTERS = 22  # Height of letters: the narrowest tile's width over this, ...
 _LEAST_LETTERS = 10  # ... at least, in pixels
 _GAP = 2
 ERROR_GAIN = 4.0  #: Factor of errors before they are shown
+BODY_COLOR = (0.25, 0.5, 0.95)
+
+Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]  #: Positions and colours
 
 
 @cache
@@ -226,3 +232,41 @@ def save_png(picture: np.ndarray, path: Path) -> None:
         path: Of the file.
     """
     write_atomically(path, lambda temporary: Image.fromarray(picture).save(temporary, format="PNG"))
+
+
+def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
+    """Point clouds of one subject.
+
+    ``points``: unprojected pixels in their colours; ``body``: body vertices, where the data
+    has them; ``points_and_body``: both, whose distance the Chamfer term measures. Empty
+    clouds are left out.
+
+    Args:
+        batch: Photographs, masks and bodies are read.
+        prediction: Of that batch.
+        element: Number of the subject in the batch.
+        limit: Largest number of points and of vertices.
+
+    Returns:
+        Positions [n, 3] in metres and colours [n, 3] in [0, 1] by name.
+    """
+    valid = prediction.points.valid[element] & batch.masks[element]
+    colors = batch.images[element].movedim(1, -1)
+    parts = {"points": (prediction.points.pixels[element][valid], colors[valid])}
+    if batch.body_vertices is not None:
+        body = batch.body_vertices[element]
+        parts["body"] = (body, body.new_tensor(BODY_COLOR).expand(len(body), 3))
+    parts = {name: _thinned(cloud, limit) for name, cloud in parts.items()}
+    if "body" in parts:
+        pairs = zip(parts["points"], parts["body"], strict=True)
+        parts["points_and_body"] = tuple(torch.cat(pair) for pair in pairs)
+    return {name: cloud for name, cloud in parts.items() if len(cloud[0])}
+
+
+def _thinned(cloud: Cloud, limit: int) -> Cloud:
+    positions, colors = (part.detach().float().cpu() for part in cloud)
+    finite = positions.isfinite().all(-1)
+    positions = positions[finite]
+    colors = colors[finite].nan_to_num(0).clamp(0, 1)
+    step = max(1, -(-len(positions) // limit))
+    return positions[::step], colors[::step]

@@ -10,7 +10,7 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.recalibration.inspection import attention_of
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
-from ghgs_lit.visualization.clouds import clouds
+from ghgs_lit.visualization.pictures import clouds
 from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 
