@@ -46,6 +46,7 @@ class OfPhotographs(Verb):
 class Predict(OfPhotographs, Measured):
     """Turn photographs into a splat, pictures and a page."""
 
+    work = "ghgs_capture.verbs.predict.run"
     example = "ghgs predict images=photographs cameras=cameras.json masks=masks out=splat"
     opens = ("checkpoint",)
     reads_data = True
@@ -88,15 +89,11 @@ class Predict(OfPhotographs, Measured):
     sequence: SequenceOptions = SequenceOptions()
     """Which instants count, and how the videos of cameras fit together."""
 
-    def run(self) -> object:
-        from ghgs_capture.verbs import predict
-
-        return predict.run(self)
-
 
 class View(Predict):
     """A page in the browser to look around in a prediction."""
 
+    work = "ghgs_capture.verbs.view.run"
     example = "ghgs view path=runs/predict/..."
     opens = ()
     reads_data = False
@@ -117,15 +114,11 @@ class View(Predict):
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
 
-    def run(self) -> object:
-        from ghgs_capture.verbs import view
-
-        return view.run(self)
-
 
 class Adapt(OfPhotographs, Training):
     """Train the weights of the package further on the instants of your capture, in minutes."""
 
+    work = "ghgs_capture.verbs.adapt.run"
     example = "ghgs adapt cameras=cameras.json images=photographs masks=masks out=mine.ckpt"
     opens = ("checkpoint",)
 
@@ -136,15 +129,11 @@ class Adapt(OfPhotographs, Training):
     out: PathText | None = None
     """File for the weights; null: adapted.ckpt in the run's directory."""
 
-    def run(self) -> object:
-        from ghgs_capture.verbs import adapt
-
-        return adapt.run(self)
-
 
 class Doctor(OfPhotographs):
     """Whether cameras and masks fit together, and what this machine lacks."""
 
+    work = "ghgs_capture.verbs.doctor.run"
     example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"
     reads_at_once = True
 
@@ -153,8 +142,3 @@ class Doctor(OfPhotographs):
     machine: what there is, and what is missing for which feature."""
     device: Device = "auto"
     """Of task=machine."""
-
-    def run(self) -> object:
-        from ghgs_capture.verbs import doctor
-
-        return doctor.run(self)

@@ -1,4 +1,4 @@
-"""What ``dry_run`` tries of the runs of a sweep: everything that they need before their first step."""
+"""Check for ``dry_run`` everything that runs need before their first step."""
 
 import re
 import tempfile
@@ -24,11 +24,11 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Train
     from ghgs_lit.data.datamodule import PhotographsDataModule
-    from ghgs_lit.data.reader import Reader
+    from ghgs_lit.data.dataset import DataSet
 
 
 def rehearse(runs: Sequence["Train"]) -> Rehearsal:
-    """Try what runs need, each different need once. Nothing is rendered or written, and no step is taken.
+    """Check what runs need, each configuration once. Nothing is rendered or written, and no step is taken.
 
     Args:
         runs: as configured.
@@ -36,31 +36,27 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
     Returns:
         Reasons and notes.
     """
-    rehearsed = _Rehearsed()
-    tried = set()
+    findings = _Findings()
+    distinct = {config_hash({**run.plain, "seed": 0}): run for run in runs}
     quiet()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for given in runs:
-            run = given.changed(data={"workers": 0})
-            key = config_hash({**run.plain, "seed": 0})
-            if key not in tried:
-                rehearsed.check(run, Path(folder))
-            tried.add(key)
-    return Rehearsal(_summarize(rehearsed.reasons), list(rehearsed.notes))
+        for run in distinct.values():
+            findings.check(run.changed(data={"workers": 0}), Path(folder))
+    return Rehearsal(_summarize(findings.reasons), list(findings.notes))
 
 
-class _Rehearsed:
-    """Why runs would be refused, and what else they should know, as keys in order of appearance."""
+class _Findings:
+    """Reasons and notes, as keys in order of appearance."""
 
     def __init__(self) -> None:
         self.reasons: dict[str, None] = {}
         self.notes: dict[str, None] = {}
-        #: Whether the files of data and phases, which several configurations share, are there.
-        self.complete: dict[str, bool] = {}
+        #: Whether all files exist, by data and phase, which several configurations share.
+        self.complete: dict[tuple[str, str], bool] = {}
 
     def attempt(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        """The result of a call; None where it refuses its input, which is noted."""
+        """The result of a call; None where it raises an error of its input, which becomes a reason."""
         try:
             return function(*arguments, **named)
         except (InputError, OSError) as error:
@@ -68,12 +64,7 @@ class _Rehearsed:
             return None
 
     def check(self, run: "Train", folder: Path) -> None:
-        """Build what a run would use.
-
-        Args:
-            run: as configured.
-            folder: for files of loggers.
-        """
+        """Build what a run would use; loggers write to ``folder``."""
         self.attempt(job.check_config, run)
         if run.resume not in (None, "auto"):
             self.attempt(read_checkpoint, run.resume)
@@ -99,66 +90,49 @@ class _Rehearsed:
             self.notes |= {} if needed is None else {needed: None}
 
     def check_data(self, run: "Train", data: "PhotographsDataModule") -> bool:
-        """Note what is missing of the data of a run.
-
-        Args:
-            run: as configured.
-            data: of the run.
-
-        Returns:
-            Whether its files are there.
-        """
+        """Note what is missing of the data of a run; whether its files exist."""
         split = run.evaluation.split
-        if hasattr(data.dataset, "cache_dir") and not _is_rendered(data, {"train", "val", split}):
-            self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
+        dataset = data.dataset
+        if hasattr(dataset, "cache_dir") and not _is_rendered(data, {"train", "val", split}):
+            self.notes[f"data={dataset.name}: people are rendered before the first step"] = None
             return False
         chamfer = getattr(getattr(run.loss, "weights", None), "chamfer", None)  # a plug-in's may have none
         expected = f"expected body vertices for loss.weights.chamfer={chamfer} (0 does without); found none"
-        is_whole = True
-        phases = [name for name in dict.fromkeys(("train", split)) if name in data.dataset.split_names]
-        for phase in phases:
-            key = f"{config_hash(run.plain['data'], without=())} {phase}"
-            if key not in self.complete:
+        keys = [(config_hash(run.plain["data"], without=()), phase) for phase in ("train", split)]
+        for key in keys:
+            phase = key[1]
+            if key not in self.complete and phase in dataset.split_names:
                 bodies = expected if chamfer and phase == "train" else None
-                self.complete[key] = self.attempt(self.check_files, data, phase, bodies) or False
-            is_whole = is_whole and self.complete[key]
-        if not is_whole:
+                lines = self.attempt(_find_missing_files, dataset, phase, bodies)
+                self.reasons |= dict.fromkeys(lines or ())
+                self.complete[key] = lines == []
+        if not all(self.complete.get(key, True) for key in keys):
             return False
-        batch = self.attempt(data.training_batch, 0)  # now what is in the files
+        batch = self.attempt(data.training_batch, 0)  # reads the content of the files
         self.attempt(check_evaluation, run, data)
         if chamfer and batch is not None and batch.body_vertices is None:
             place = data.photographs("train").reader.body_place(batch.subjects[0])
             self.reasons[f"{place}: {expected}"] = None
         return True
 
-    def check_files(self, data: "PhotographsDataModule", phase: str, bodies: str | None) -> bool:
-        """Note the files that a phase lacks, one line for those that differ in numbers alone.
 
-        Args:
-            data: as configured.
-            phase: name of a split.
-            bodies: what a missing body is reported by; None: none are needed.
-
-        Returns:
-            Whether nothing is missing.
-        """
-        reader = data.dataset.reader(phase, strict=False)
-        known = len(self.reasons)
-        lines = list(reader.problems)
-        for name in reader.subjects:
-            body = reader.body_place(name)
-            lacks_body = bodies is not None and isinstance(body, Path) and not body.exists()
-            for path in self.attempt(_files_of, reader, name) or ():
-                if not path.exists() and not (lacks_body and path == body):
-                    lines.append(f"{path}: expected a file of the data set; found none")
-            if lacks_body:
-                lines.append(f"{body}: {bodies}")
-        self.reasons |= dict.fromkeys(_summarize(lines))
-        return not lines and len(self.reasons) == known
-
-
-def _files_of(reader: "Reader", name: str) -> list[Path]:
-    return list(reader.files(name))
+def _find_missing_files(dataset: "DataSet", phase: str, bodies: str | None) -> list[str]:
+    """A line for each file that a phase lacks; ``bodies`` reports a missing body, None: none is needed."""
+    reader = dataset.reader(phase, strict=False)
+    lines = list(reader.problems)
+    for name in reader.subjects:
+        body = reader.body_place(name)
+        lacks_body = bodies is not None and isinstance(body, Path) and not body.exists()
+        try:
+            missing = [path for path in reader.files(name) if not path.exists()]
+        except (InputError, OSError) as error:
+            lines.append(" ".join(str(error).split()))
+            missing = []
+        if lacks_body:
+            missing = [path for path in missing if path != body]
+            lines.append(f"{body}: {bodies}")
+        lines += [f"{path}: expected a file of the data set; found none" for path in missing]
+    return lines
 
 
 def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:

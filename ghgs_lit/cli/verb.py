@@ -13,6 +13,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from ghgs_lit.config.options import Patches, PathText, Seed
+from ghgs_lit.config.registry import import_object
 from ghgs_lit.config.run import Run
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -26,6 +27,8 @@ class Verb(Run):
     """Base of all verbs; the first line of the docstring is the summary that
     ``ghgs --help`` prints."""
 
+    work: ClassVar[str] = ""
+    """Import path of the function that does the work; a verb without one defines :meth:`run`."""
     example: ClassVar[str] = ""
     """A command, for ``ghgs --help``."""
     opens: ClassVar[tuple[str, ...]] = ()
@@ -67,7 +70,7 @@ class Verb(Run):
         Returns:
             A number that a sweeper optimises, if any.
         """
-        raise NotImplementedError
+        return import_object(self.work)(self)
 
 
 class Measured(Verb):

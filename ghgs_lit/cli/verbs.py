@@ -15,6 +15,7 @@ from ghgs_lit.config.options import Count, PathText, Seed, Text, Words, Workers
 class Train(Training):
     """Train the paper's model, or model=hull or model=recurrent, and evaluate it."""
 
+    work = "ghgs_lit.cli.train.run"
     example = "ghgs train data=synthetic trainer.max_time=00:00:10:00"
     begins_run = True
     opens = ("resume", "init_from")
@@ -39,27 +40,22 @@ class Train(Training):
             from ghgs_lit.cli import rehearsal
 
             return rehearsal.plan(self)
-        from ghgs_lit.cli import train
-
-        return train.run(self)
+        return super().run()
 
 
 class Pretext(Training):
     """Train the semantic branch of an encoder on the parts of built-in people."""
 
+    work = "ghgs_lit.cli.pretext.run"
     example = "ghgs pretext data=synthetic data/rig=varied trainer.max_time=00:00:15:00"
     begins_run = True
     reads_data = True
-
-    def run(self) -> object:
-        from ghgs_lit.cli import pretext
-
-        return pretext.run(self)
 
 
 class Evaluate(Measured):
     """Measure a checkpoint or the baselines."""
 
+    work = "ghgs_lit.cli.evaluate.run"
     example = "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt"
     opens = ("checkpoint",)
     reads_data = True
@@ -77,15 +73,11 @@ class Evaluate(Measured):
     per_scene: PerScene = PerScene()
     """3D Gaussian splatting on each subject's inputs."""
 
-    def run(self) -> object:
-        from ghgs_lit.cli import evaluate
-
-        return evaluate.run(self)
-
 
 class Benchmark(Measured):
     """Run time against error of the presets of skip, by stage."""
 
+    work = "ghgs_lit.cli.benchmark.run"
     example = "ghgs benchmark checkpoint=runs/train/.../checkpoints/last.ckpt presets=[none,exact,balanced]"
 
     checkpoint: PathText | None = None
@@ -105,15 +97,11 @@ class Benchmark(Measured):
     threads: int | None = Field(None, ge=1, le=1024)
     """Threads of PyTorch, of which no machine has more than 1024; null: as many as it chooses."""
 
-    def run(self) -> object:
-        from ghgs_lit.cli import benchmark
-
-        return benchmark.run(self)
-
 
 class Stress(Verb):
     """Every stage on adversarial inputs, against float64."""
 
+    work = "ghgs_lit.cli.stress.run"
     example = "ghgs stress quick=true"
 
     quick: bool = False
@@ -125,15 +113,11 @@ class Stress(Verb):
     workers: Workers | None = None
     """Processes; null: one for each processor, 0: this one."""
 
-    def run(self) -> object:
-        from ghgs_lit.cli import stress
-
-        return stress.run(self)
-
 
 class Table(Verb):
     """Collect a sweep into the paper's table."""
 
+    work = "ghgs_lit.cli.table.run"
     example = "ghgs table runs=runs/train/sweep_..."
 
     runs: Annotated[
@@ -158,15 +142,11 @@ class Table(Verb):
     test: PairedTest = PairedTest()
     """The test between rows."""
 
-    def run(self) -> object:
-        from ghgs_lit.cli import table
-
-        return table.run(self)
-
 
 class Prepare(Verb):
     """Render scans into training data, or make the built-in people."""
 
+    work = "ghgs_lit.cli.prepare.run"
     example = "ghgs prepare task=render data=scans data.source=scans data.root=rendered"
 
     task: Literal["render", "check"] = "render"
@@ -176,15 +156,11 @@ class Prepare(Verb):
     seed: Seed = 0
     """Of the samples that task=check draws."""
 
-    def run(self) -> object:
-        from ghgs_lit.cli import prepare
-
-        return prepare.run(self)
-
 
 class Import(Verb):
     """Published weights to a checkpoint."""
 
+    work = "ghgs_lit.cli.weights.run_import"
     example = "ghgs import vggt=facebook/VGGT-1B release=release.pth out=release.ckpt"
 
     vggt: PathText | None = None
@@ -199,15 +175,11 @@ class Import(Verb):
     overwrite: bool = False
     """Replace a file that exists."""
 
-    def run(self) -> object:
-        from ghgs_lit.cli import import_
-
-        return import_.run(self)
-
 
 class Export(Verb):
     """A checkpoint to a small one for prediction, or to the published names."""
 
+    work = "ghgs_lit.cli.weights.run_export"
     example = "ghgs export checkpoint=checkpoints/last.ckpt inference=small.ckpt"
     opens = ("checkpoint",)
 
@@ -224,8 +196,3 @@ class Export(Verb):
     """Of the weights in it."""
     overwrite: bool = False
     """Replace files that exist."""
-
-    def run(self) -> object:
-        from ghgs_lit.cli import export
-
-        return export.run(self)

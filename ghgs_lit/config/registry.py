@@ -248,11 +248,14 @@ def _path_of(what: type[Options] | str) -> str:
     return what if isinstance(what, str) else what.__qualname__
 
 
-def _imported(what: type[Options] | str) -> type[Options]:
-    if not isinstance(what, str):
-        return what
-    module, _, name = what.rpartition(".")
+def import_object(path: str) -> Any:
+    """The object of an import path such as ``my_package.scans.Scans``."""
+    module, _, name = path.rpartition(".")
     return getattr(importlib.import_module(module), name)
+
+
+def _class_of(what: type[Options] | str) -> type[Options]:
+    return import_object(what) if isinstance(what, str) else what
 
 
 def verbs() -> list[str]:
@@ -269,7 +272,7 @@ def verb_class(name: str) -> type[Options]:
     """
     if name not in VERBS:
         load_plugins()
-    return _imported(VERBS.get(name) or _REGISTERED[_VERBS, name])
+    return _class_of(VERBS.get(name) or _REGISTERED[_VERBS, name])
 
 
 @cache
@@ -308,7 +311,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     if isinstance(kind, str) and kind not in known:
         _load(group)
         if (group, kind) in _REGISTERED:
-            return _imported(_REGISTERED[group, kind])
+            return _class_of(_REGISTERED[group, kind])
     if not (kind is None or isinstance(kind, str)) or kind not in known:
         names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
@@ -316,7 +319,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
             f"{key}{'.kind' * (group in KINDS)}: expected {expected}; found {shown(kind)}"
             f"{did_you_mean(kind, names)} ({VARIABLE}=file.py adds kinds of your own)"
         )
-    return _imported(known[kind])
+    return _class_of(known[kind])
 
 
 def class_of_node(node: Mapping[str, Any], key: str) -> type[Options]:

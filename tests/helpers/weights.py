@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from ghgs_lit.cli.import_ import MODEL_NODES, empty_state
+from ghgs_lit.cli.weights import MODEL_NODES, empty_state
 from ghgs_lit.config import compose
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights import published

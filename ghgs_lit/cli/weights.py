@@ -1,24 +1,60 @@
-"""``ghgs export``: write a checkpoint under the published names, or a small one for prediction."""
+"""``ghgs import`` and ``ghgs export``: published weights to a checkpoint of this package and back."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
+from ghgs_lit.cli.inputs import MODEL_NODES
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_config
 from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
 from ghgs_lit.execution import Predictor
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_config, write_inference
-from ghgs_lit.weights.published import export_weights
+from ghgs_lit.weights.published import export_weights, import_weights
 from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
 
 if TYPE_CHECKING:
-    from ghgs_lit.cli.verbs import Export
+    from ghgs_lit.cli.verbs import Export, Import
 
 _PATCHES = 8  # along each side of the photographs on which two models are compared
+
+
+def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
+    """Tensors that published weights fill, on the meta device.
+
+    Args:
+        config: the nodes of the model as plain data.
+        release: the authors' checkpoint; None: the tensors of the encoder alone.
+    """
+    state = GHGS.from_config(config, empty=True).state_dict()
+    return {name: tensor for name, tensor in state.items() if release or name.startswith("encoder.")}
+
+
+def run_import(verb: "Import") -> None:
+    """Write the checkpoint, and print what it was made of.
+
+    Args:
+        verb: the run.
+
+    Raises:
+        InputError: the weights do not fit the model, or the file exists.
+    """
+    write_config(verb, output_dir())
+    config = verb.plain
+    model = {key: config[key] for key in MODEL_NODES if key in config}
+    sources = (verb.vggt, verb.release)
+    out = files_to_write(verb, ["out"], [path for path in sources if path is not None])["out"]
+    report = import_weights(empty_state(model, verb.release), model, out, *sources, verb.dtype)
+    print("\n".join(report), flush=True)
+    if verb.release is not None and (differing := differences(config)):
+        print(f"differs from the release: {', '.join(differing)}", flush=True)
+    announce(out)
 
 
 @torch.no_grad()
@@ -44,7 +80,7 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
     return prediction_differences(*results, batch.masks)
 
 
-def run(verb: "Export") -> None:
+def run_export(verb: "Export") -> None:
     """Write the files that were asked for, and print how they differ from the checkpoint.
 
     Args:
