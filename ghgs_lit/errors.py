@@ -57,7 +57,7 @@ def installed(package: str, extra: str, key: str) -> ModuleType:
         key: dotted key that needs the package, for the message.
 
     Raises:
-        InputError: the package cannot be imported; the message says how to install it.
+        InputError: the package cannot be imported; the message contains the command that installs it.
     """
     try:
         return importlib.import_module(package)

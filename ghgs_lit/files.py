@@ -21,7 +21,7 @@ _OWNER = b"process "  #: How the text of a lock file begins
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
-    """Write a file beside ``path``, wait for the disk, then rename it to ``path``.
+    """Write a file next to ``path``, wait for the disk, then rename it to ``path``.
 
     Readers see the old file or the new one, never a part. Folders are made. A link is replaced,
     and the file that it points to stays. A temporary file of a process that was killed is
@@ -46,7 +46,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
         os.replace(temporary, path)
         _sync(path.parent)
     except Exception as error:
-        # PyTorch and safetensors report a full disk by errors of their own.
+        # PyTorch and safetensors report a full disk by other errors.
         cause = error if isinstance(error, OSError) else _refusal(temporary)
         if cause is None or cause.errno is None:
             raise
@@ -80,7 +80,7 @@ def require_free(path: str | Path, key: str, overwrite: bool) -> None:
 
     Raises:
         InputError: the file exists, is none that :func:`write_atomically` would replace, or its
-            folder cannot be written to, which is said before hours of work, not after them.
+            folder cannot be written to, which is an error before hours of work, not after them.
     """
     path = Path(path).expanduser()
     _require_replaceable(path)
@@ -181,7 +181,7 @@ def require_no_links(directory: Path, names: Iterable[str]) -> None:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append ``text`` as a line of its own, also after an unfinished line of a killed process.
+    """Append ``text`` as a new line, also after an unfinished line of a killed process.
 
     Args:
         path: the file; it and its folders are made.

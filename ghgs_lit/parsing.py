@@ -211,7 +211,7 @@ def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray"
     try:
         # Mapping the file fails where it is too short; reading it would allocate the memory first.
         return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
-    except Exception as error:  # headers are Python, whose tokenizer has errors of its own
+    except Exception as error:  # headers are Python, whose tokenizer raises other errors
         raise InputError(f"{path}: expected {expected}; found a file that cannot be read: {error}") from error
 
 

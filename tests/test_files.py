@@ -114,56 +114,45 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
     assert not is_locked(path)
 
 
-def limited_write(kind, path, answers):
-    """In a process of its own: write 4 MB where files may have half of one,
+def write_limited(kind, folder, answers):
+    """In a process of its own: write 4 MB or more where files may have half of one,
     as on a disk that is full."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
-    # no threads after a fork
-    content = {"weights": torch.from_numpy(np.zeros(1 << 20, np.float32))}
+    numbers = np.zeros(1 << 20, np.float32)
+    content = {"weights": torch.from_numpy(numbers)}  # no threads after a fork
     write = {
-        "text": lambda temporary: temporary.write_text("x" * (4 << 20)),
-        "torch": lambda temporary: torch.save(content, temporary),
-        "safetensors": lambda temporary: save_file(content, temporary),
-    }[kind]
+        "text": lambda path: path.write_text("x" * (4 << 20)),
+        "torch": lambda path: torch.save(content, path),
+        "safetensors": lambda path: save_file(content, path),
+    }
     try:
-        write_atomically(path, write)
-    except BaseException as error:
-        answers.put((type(error), str(error)))
-
-
-@pytest.mark.parametrize("kind", ["text", "torch", "safetensors"])
-def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, kind):
-    """PyTorch and safetensors hide the system's reason in errors of their own, without a path."""
-    context = multiprocessing.get_context("fork")
-    answers, path = context.Queue(), tmp_path / "last.ckpt"
-    process = context.Process(target=limited_write, args=(kind, path, answers))
-    process.start()
-    answer = answers.get(timeout=60)
-    process.join(60)
-    assert answer == (OSError, f"[Errno 27] File too large: '{path}'")
-    assert list(tmp_path.iterdir()) == []
-
-
-def limited_save(folder, answers):
-    """In a process of its own: NumPy writes 8 MB where files may have half of one."""
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
-    try:
+        if kind in write:
+            write_atomically(folder / "last.ckpt", write[kind])
         with naming(folder):
-            np.save(folder / "a.npy", np.zeros(1 << 20))
+            np.save(folder / "a.npy", numbers)
     except BaseException as error:
         answers.put((type(error), str(error)))
 
 
-def test_a_full_disk_names_the_folder_where_no_file_is_named(tmp_path):
-    """NumPy says how many numbers it wrote, and neither why no more nor where."""
+@pytest.mark.parametrize(
+    ("kind", "named", "left"),
+    [
+        ("text", "last.ckpt", []),
+        ("torch", "last.ckpt", []),
+        ("safetensors", "last.ckpt", []),
+        ("numpy", "", ["a.npy"]),
+    ],
+)
+def test_a_full_disk_is_reported_with_the_file_or_folder(tmp_path, kind, named, left):
+    """Libraries hide the system's reason in errors of their own, without a path."""
     context = multiprocessing.get_context("fork")
     answers = context.Queue()
-    process = context.Process(target=limited_save, args=(tmp_path, answers))
+    process = context.Process(target=write_limited, args=(kind, tmp_path, answers))
     process.start()
     answer = answers.get(timeout=60)
     process.join(60)
-    assert answer == (OSError, f"[Errno 27] File too large: '{tmp_path}'")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
+    assert answer == (OSError, f"[Errno 27] File too large: '{tmp_path / named}'")
+    assert names(tmp_path) == left
 
 
 def test_errors_that_name_a_file_keep_it(tmp_path):
@@ -178,26 +167,19 @@ def test_a_bug_in_the_writer_keeps_its_type(tmp_path):
         write_atomically(tmp_path / "x", lambda temporary: {}["bug"])
 
 
-def link(path, content):
+def link(path, content, kind="symlink"):
     """A link to a file of that content, which lies elsewhere."""
     target = path.with_name(f"target-of-{path.name}")
     target.write_text(content)
-    path.symlink_to(target)
-    return target
-
-
-def hard_link(path, content):
-    target = path.with_name(f"target-of-{path.name}")
-    target.write_text(content)
-    os.link(target, path)
+    getattr(path, f"{kind}_to")(target)
     return target
 
 
 @pytest.mark.parametrize("act", [lock, is_locked], ids=["lock", "is_locked"])
-@pytest.mark.parametrize("make", [link, hard_link])
-def test_a_lock_file_that_is_another_file_is_refused_and_stays(tmp_path, make, act):
+@pytest.mark.parametrize("kind", ["symlink", "hardlink"])
+def test_a_lock_file_that_is_another_file_is_refused_and_stays(tmp_path, kind, act):
     """Folders of strangers may hold a ``.lock`` that leads to a file of the user."""
-    target = make(tmp_path / ".lock", "precious")
+    target = link(tmp_path / ".lock", "precious", kind)
     with pytest.raises(InputError, match=r"\.lock: expected a lock file; found .*(link|another file)"):
         act(tmp_path / ".lock").__enter__()
     assert target.read_text() == "precious"
@@ -233,7 +215,7 @@ def test_a_lock_of_an_earlier_process_is_taken_also_through_a_linked_folder(tmp_
     """Results on another disk are linked, and a backup may share the lock file."""
     (tmp_path / "disk").mkdir()
     (tmp_path / "runs").symlink_to(tmp_path / "disk")
-    hard_link(tmp_path / "disk" / "lock", "process 4000000 on elsewhere\n")
+    link(tmp_path / "disk" / "lock", "process 4000000 on elsewhere\n", "hardlink")
     with lock(tmp_path / "runs" / "lock") as locked:
         assert locked
         assert is_locked(tmp_path / "disk" / "lock")

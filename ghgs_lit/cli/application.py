@@ -45,7 +45,7 @@ def discard_unused(directory: Path, verb: str, since: float) -> None:
     RunDirectory(directory).discard({".hydra", f"{verb}.log"}, since)
 
 
-#: What a run appends to, or what libraries write as it is, beside the log.
+#: What a run appends to, or what libraries write in place, in addition to the log.
 _WRITTEN_IN_PLACE = (".hydra", *WRITTEN, SESSIONS)
 
 
@@ -100,11 +100,11 @@ class Verb:
         sys.argv = list(self.argv)
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)
-            if HydraConfig.get().mode == RunMode.RUN:  # a file may have said that it is a sweep
+            if HydraConfig.get().mode == RunMode.RUN:  # a file may set hydra.mode
                 messages.check_directory(HydraConfig.get().overrides.hydra, sweeps=False)
             check_ablation(cfg, HydraConfig.get())
-            is_said = any(word.lstrip("+").startswith("overwrite=") for word in self.argv)
-            fits = is_said or not cfg.get("overwrite")
+            is_given = any(word.lstrip("+").startswith("overwrite=") for word in self.argv)
+            fits = is_given or not cfg.get("overwrite")
             require(fits, "overwrite", "a value on the command line alone", "true in a file")
             verb = verb_class(self.name).begin(plain(cfg))
             is_dry = getattr(verb, "dry_run", False)
@@ -178,15 +178,15 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
 
 
 def _print_configuration(name: str, overrides: list[str], values: Namespace) -> None:
-    """Do what ``--cfg job`` of Hydra does, with the defaults that no file says.
+    """Print what Hydra's ``--cfg job`` prints, with the defaults of options.
 
     Args:
-        name: of the verb, or what ``--config-name`` says.
+        name: of the verb, or the value of ``--config-name``.
         overrides: of the command line.
         values: of the flags ``--config-dir``, ``--package`` and ``--resolve``.
 
     Raises:
-        InputError: the package is not there, or a node has an unknown key.
+        InputError: the configuration has no such package, or a node has an unknown key.
     """
     cfg = compose(name, overrides, with_hydra=True, folder=values.config_dir)
     HydraConfig.instance().set_config(cfg)

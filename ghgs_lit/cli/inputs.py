@@ -1,4 +1,4 @@
-"""Data, renderer, model of a checkpoint and device, as a verb's configuration asks for them."""
+"""Data, renderer, model of a checkpoint and device, as a verb's configuration describes them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -173,7 +173,7 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
     after = OmegaConf.create(before)
     if any(is_below(key, ("rounds",)) for key in given_keys()):
         _check_rounds(checkpoint, before.get("rounds"), run.plain["rounds"])
-    for key in (given.removesuffix(".kind") for given in given_keys()):  # another kind has keys of its own
+    for key in (given.removesuffix(".kind") for given in given_keys()):  # another kind has other keys
         if key == "ablation":
             _require_ablation(trained)
         if not is_below(key, MODEL_NODES):
@@ -183,7 +183,7 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
             OmegaConf.update(after, key, value, merge=False, force_add=True)
         else:
             _require_same(before, key, value)
-    # Of the weights' own training, which may have seen smaller photographs than this one.
+    # The height follows from the weights' training, whose photographs may have been smaller.
     return with_known_height(OmegaConf.to_container(after, resolve=True), trained)
 
 

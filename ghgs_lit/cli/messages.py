@@ -160,7 +160,7 @@ def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
 def _system(error: OSError) -> str:
     """Message for a file that cannot be read or written;
     the run's directory if the error names none."""
-    if error.errno is None:  # raised by this package, with a message of its own
+    if error.errno is None:  # raised by this package, with a whole message
         return str(error)
     path = error.filename2 or error.filename
     if path is None:

@@ -133,7 +133,7 @@ def environments() -> list[ClusterEnvironment]:
     Tasks of ``srun`` are the processes of a training, those of a batch script are not.
 
     Raises:
-        InputError: ``srun`` was asked for other tasks.
+        InputError: ``srun`` was started with other tasks.
     """
     if "SLURM_NTASKS" not in os.environ or "TORCHELASTIC_RUN_ID" in os.environ:
         return []
@@ -275,7 +275,7 @@ def fit(
     except MisconfigurationException as error:  # of options that do not fit the data
         raise InputError(f"trainer: {error}") from None
     except Exception as error:
-        # Lightning reads the state of a training, which may be damaged, before it asks for data.
+        # Lightning reads the state of a training, which may be damaged, before it loads data.
         if resume is None or trainer.train_dataloader is not None or isinstance(error, InputError):
             raise
         found = f"{type(error).__name__}: {error}".splitlines()[0]

@@ -1,8 +1,8 @@
 """A verb of ``ghgs`` is one class: its summary, an example, its keys, and what it does.
 
-The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups, whose options
-are its attributes (:class:`ghgs_lit.config.run.Run`). All verbs come in by the door of
-:mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
+The fields of a verb are the keys that ``conf/<verb>.yaml`` sets in addition to its groups, whose options
+are its attributes (:class:`ghgs_lit.config.run.Run`). All verbs are registered in
+:mod:`ghgs_lit.config.registry`, those of this distribution like those of a plug-in.
 """
 
 import os

@@ -48,7 +48,7 @@ def _is_own() -> bool:
 
 
 def store_defaults(verb: str, folder: str | None = None) -> None:
-    """Give Hydra the configuration of a plug-in's verb: its own keys, at their defaults.
+    """Register the configuration of a plug-in's verb with Hydra: its keys, at their defaults.
 
     A file ``<verb>.yaml`` in ``--config-dir`` takes its place, and may add groups.
 
@@ -57,7 +57,7 @@ def store_defaults(verb: str, folder: str | None = None) -> None:
         folder: of ``--config-dir``, if any.
     """
     store = ConfigStore.instance()
-    store.repo.pop(f"{verb}.yaml", None)  # Hydra refuses a file beside it
+    store.repo.pop(f"{verb}.yaml", None)  # Hydra rejects a file of the same name
     if any(Path(place, f"{verb}.yaml").is_file() for place in (conf_dir(), folder) if place is not None):
         return
     node = {"defaults": ["_self_", {"override hydra/output": "ghgs"}], "hydra": {"job": {"name": verb}}}
@@ -82,7 +82,7 @@ def compose(
 
     Raises:
         HydraException: an override does not fit.
-        InputError: a node names a kind that there is not.
+        InputError: a node names an unknown kind.
     """
     if verb in verbs():
         store_defaults(verb, folder)
@@ -121,7 +121,7 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     """
     try:
         missing = sorted(OmegaConf.missing_keys(cfg))
-    except InterpolationResolutionError:  # perhaps of a key that no file says
+    except InterpolationResolutionError:  # perhaps of a key that has only a default
         missing = sorted(OmegaConf.missing_keys(fill(cfg)))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
@@ -143,7 +143,7 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
 
     Raises:
         InputError: a key has another value, or a file that sets keys of the whole configuration
-            lacks the line that says so.
+            lacks its line ``@package``.
     """
     for group in _GLOBAL:
         if group in cfg:
@@ -208,7 +208,7 @@ def read_options(group: str, names: Sequence[str], run: Run, key: str) -> dict[s
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
-    """The values of ``<group>/<name>.yaml``, including its own defaults, as plain data.
+    """The values of ``<group>/<name>.yaml``, including its list of defaults, as plain data.
 
     An application of the package also searches the user's ``--config-dir``.
 

@@ -13,11 +13,11 @@ from omegaconf import MISSING, DictConfig, OmegaConf, flag_override
 from pydantic import BaseModel
 
 from ghgs_lit.config.options import options_of
-from ghgs_lit.config.registry import class_of_node, nodes_of, says_its_class, verb_class
+from ghgs_lit.config.registry import class_of_node, has_kind, nodes_of, verb_class
 
 
 def with_defaults(values: Mapping[str, Any], cls: type[BaseModel]) -> dict[str, Any]:
-    """Values of options as YAML would say all of them.
+    """Values of options, completed by the defaults of their class.
 
     Args:
         values: plain data by key, unchecked; unknown keys stay, for a check to refuse.
@@ -56,11 +56,11 @@ def _plain(value: Any) -> Any:
 
 
 def of_verb(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of a verb with all of its own keys; those that must be given are ``???``.
+    """The configuration of a verb with all of its keys; those that must be given are ``???``.
 
     Args:
         name: of the verb.
-        values: what its file says, groups included.
+        values: content of its file, groups included.
     """
     cls = verb_class(name)
     must = {key: MISSING for key, field in cls.model_fields.items() if field.is_required()}
@@ -77,10 +77,10 @@ def fill(cfg: DictConfig) -> DictConfig:
         ``cfg``.
 
     Raises:
-        InputError: a node names a kind that there is not.
+        InputError: a node names an unknown kind.
     """
     for key, node in list(nodes_of(cfg)):
-        if OmegaConf.is_dict(node) and says_its_class(key, node):
+        if OmegaConf.is_dict(node) and has_kind(key, node):
             values = OmegaConf.to_container(node)
             full = with_defaults(values, class_of_node(node, key))
             with flag_override(cfg, ["readonly", "struct"], False):
@@ -89,15 +89,15 @@ def fill(cfg: DictConfig) -> DictConfig:
 
 
 def open_nodes(path: str, package: str, content: DictConfig) -> None:
-    """Let Hydra override keys of options that their file does not say.
+    """Let Hydra override keys of options that their file does not set.
 
     Args:
         path: of the file below the folder of configurations, such as ``bounds/box``.
-        package: what its line ``@package`` says; empty: its group.
-        content: what it says, which gets the flag.
+        package: value of its line ``@package``; empty: its group.
+        content: the file's, which gets the flag.
     """
     group = path.split("/")[0]
     root = content if group == path or package == "_global_" else {group: content}
     for key, node in nodes_of(root):
-        if OmegaConf.is_dict(node) and says_its_class(key, node):
+        if OmegaConf.is_dict(node) and has_kind(key, node):
             OmegaConf.set_struct(node, False)

@@ -1,4 +1,4 @@
-"""Where the package's own configuration files are."""
+"""Folder of the package's configuration files."""
 
 from pathlib import Path
 from typing import Any
@@ -7,12 +7,12 @@ import hydra
 
 from ghgs_lit.errors import InputError
 
-#: Hydra 1.3 asks for the version to be compatible with; later versions do not.
+#: Hydra 1.3 requires the version to be compatible with; later versions do not.
 VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
 
 
 def conf_dir() -> Path:
-    """Absolute path of ``conf``: inside the package in a wheel, beside it in a checkout.
+    """Absolute path of ``conf``: inside the package in a wheel, next to it in a checkout.
 
     Raises:
         InputError: neither is there.

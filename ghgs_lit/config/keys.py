@@ -61,7 +61,7 @@ _MOST_LEVELS = 32
 
 
 def require_plain(config: Any, where: str) -> None:
-    """Refuse a configuration that YAML could not have said.
+    """Reject a configuration that YAML cannot express.
 
     Args:
         config: mappings with keys of text, lists, texts and numbers are plain.
@@ -154,7 +154,7 @@ def ablation_of(config: Mapping[str, Any]) -> str:
             the option of the group ``ablation`` that was chosen.
 
     Returns:
-        The option where it is a user's own; else the name that :data:`ABLATIONS` gives to the
+        The option where it is user-defined; else the name that :data:`ABLATIONS` gives to the
         model's switches, which the command line may have set one by one.
     """
     name = lookup(config, "chosen.ablation")
@@ -162,5 +162,5 @@ def ablation_of(config: Mapping[str, Any]) -> str:
 
 
 def is_own_ablation(name: Any) -> bool:
-    """Whether ``name`` is an option of the group ``ablation`` that is a user's own."""
+    """Whether ``name`` is a user-defined option of the group ``ablation``."""
     return isinstance(name, str) and name not in ABLATIONS.values()

@@ -13,7 +13,7 @@ Views = Annotated[int, Field(ge=2)]
 
 
 class Calibration(Options):
-    """Corrections of what the file of cameras omits or says wrongly;
+    """Corrections of what the file of cameras omits or states wrongly;
     null: as its format defines it."""
 
     group = "calibration"

@@ -1,4 +1,4 @@
-"""Options: classes of typed fields that configure a stage, defined once beside it.
+"""Options: classes of typed fields that configure a stage, defined once next to it.
 
 A field has a type with a range, a default and, in the text below it, a unit and meaning. Values are
 checked wherever they come from (YAML, command line, checkpoint, Python);
@@ -49,7 +49,7 @@ def expected(field: FieldInfo) -> str:
 
 
 def options_of(annotation: Any) -> type[BaseModel] | None:
-    """The class of options that an annotation allows (perhaps beside None), or None."""
+    """The class of options that an annotation allows (alone or with None), or None."""
     for choice in (annotation, *get_args(annotation)):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             return choice

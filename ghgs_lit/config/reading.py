@@ -1,4 +1,4 @@
-"""How Hydra reads overrides and files here, and what others' files may set in it.
+"""Read overrides and files for Hydra, and limit what others' files may set.
 
 Others' are those of ``--config-dir`` and ``hydra.searchpath``.
 Such files can come from somebody else. Their keys of the package's groups are options, which are
@@ -59,7 +59,7 @@ _MOST_VALUES = 100_000
 class FileConfigSource(file_config_source.FileConfigSource):
     """Hydra's reader of files, which checks those that do not belong to the package."""
 
-    # Hydra's registry takes a class of this name for its own, and then does not replace it.
+    # Hydra's registry takes a class of this name for its default, and then does not replace it.
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
@@ -94,7 +94,7 @@ def read_as_ghgs() -> None:
 @contextmanager
 def reading_as_ghgs() -> Iterator[None]:
     """Let applications of the block read so; those of another program do not."""
-    Plugins.instance()  # registers Hydra's own
+    Plugins.instance()  # registers Hydra's sources
     types = SourcesRegistry.instance().types
     before = types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader
     read_as_ghgs()

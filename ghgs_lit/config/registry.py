@@ -1,5 +1,5 @@
-"""Registry of what a configuration may build: kinds of options by group,
-never a path of Python code.
+"""Registry of the kinds of options that a configuration may build, by group, and of verbs;
+a configuration never contains a path of Python code.
 
 A configuration can come from somebody else's checkpoint, so a node such as
 ``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Kinds and
@@ -14,7 +14,6 @@ import gc
 import importlib
 import importlib.metadata
 import importlib.util
-import marshal
 import os
 import pkgutil
 import sys
@@ -195,7 +194,7 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
 def register_verb(name: str) -> Callable[[_C], _C]:
     """Class decorator that registers a :class:`ghgs_lit.cli.verb.Verb` as ``ghgs <name>``.
 
-    Without a file ``<name>.yaml`` in ``--config-dir`` the verb has its own keys alone.
+    Without a file ``<name>.yaml`` in ``--config-dir`` the verb has its keys and no groups.
 
     Args:
         name: a new one.
@@ -276,18 +275,18 @@ def verb_class(name: str) -> type[Options]:
 
 
 @cache
-def _import_room(group: str) -> None:
+def _import_subpackage(group: str) -> None:
     """Import all files of the group's subpackage, so that they register their kinds."""
     parts = next(iter(KINDS[group].values())).split(".")
-    room = ".".join(parts[: 3 if parts[1] == "method" else 2])
-    for file in pkgutil.iter_modules(importlib.import_module(room).__path__, f"{room}."):
+    subpackage = ".".join(parts[: 3 if parts[1] == "method" else 2])
+    for file in pkgutil.iter_modules(importlib.import_module(subpackage).__path__, f"{subpackage}."):
         importlib.import_module(file.name)
 
 
 def _load(group: str) -> None:
     load_plugins()
     if group in KINDS and None not in KINDS[group]:
-        _import_room(group)
+        _import_subpackage(group)
 
 
 def kinds_of(group: str) -> list[str | None]:
@@ -301,7 +300,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
 
     Args:
         group: name of a group, such as ``bounds``.
-        kind: what the node says, of any type; None: the group has no kinds.
+        kind: value in the node, of any type; None: the group has no kinds.
         key: dotted key of the node, for messages.
 
     Raises:
@@ -336,10 +335,6 @@ def class_of_node(node: Mapping[str, Any], key: str) -> type[Options]:
     return class_of(group, None if None in KINDS[group] else node.get("kind"), key)
 
 
-#: Options of the nodes that were read, by class, key and values.
-_READ: dict[tuple[type[Options], str, bytes], Options] = {}
-
-
 def read_node(node: Any, key: str) -> Options:
     """The checked options of a node.
 
@@ -358,19 +353,7 @@ def read_node(node: Any, key: str) -> Options:
     cls = class_of_node(values, key)
     if None not in KINDS[key.split(".")[0]]:
         values.pop("kind", None)
-    # Options do not change: a node is read once in a process, whoever asks for it.
-    # Types and order count.
-    try:
-        known = (
-            cls,
-            key,
-            marshal.dumps(values, 2),
-        )  # version 2: without references, equal bytes
-    except ValueError:  # not plain data, as a Python user may give
-        return cls.read(values, key)
-    if known not in _READ:
-        _READ[known] = cls.read(values, key)
-    return _READ[known]
+    return cls.read(values, key)
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
@@ -404,7 +387,7 @@ def nodes_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield group, node
 
 
-def says_its_class(key: str, node: Mapping[str, Any]) -> bool:
+def has_kind(key: str, node: Mapping[str, Any]) -> bool:
     """Whether a node describes an object: keys that change a checkpoint's data have no kind,
     for example.
 
@@ -430,6 +413,6 @@ def read_nodes(config: Mapping[str, Any]) -> dict[str, Options]:
     options = {}
     for key, node in nodes_of(config):
         # Skipped without a kind: an optimizer that the verb lacks, for example.
-        if key.split(".")[0] in NAMED or not isinstance(node, Mapping) or says_its_class(key, node):
+        if key.split(".")[0] in NAMED or not isinstance(node, Mapping) or has_kind(key, node):
             options[key] = read_node(node, key)
     return options

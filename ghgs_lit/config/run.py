@@ -35,8 +35,8 @@ class Run(Options):
     """Keys of a verb as fields, options of each config group as attributes;
     None: it has no such group.
 
-    Types are those of the shipped kinds that verbs read; a kind of a user's own has these
-    attributes, too. A node that says no kind where its group has some, such as changes of a
+    Types are those of the shipped kinds that verbs read; a user-defined kind has these
+    attributes, too. A node without a kind where its group has kinds, such as changes of a
     checkpoint's data, is part of :attr:`plain` alone.
     """
 

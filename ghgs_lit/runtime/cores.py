@@ -1,5 +1,5 @@
-"""The cores that this process may use, how its threads wait for one another,
-and how it starts others."""
+"""The cores that this process may use, how its threads wait, and how it starts
+other processes."""
 
 import fcntl
 import multiprocessing
@@ -26,7 +26,7 @@ def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg"
     one per machine may.
 
     Args:
-        arguments: of the command line; threads sleep where one asks for several processes.
+        arguments: of the command line; threads sleep where one starts several processes.
         running: Linux's file of the numbers of running and of all threads.
     """
     try:
@@ -48,8 +48,8 @@ def children_sleep() -> None:
 
 
 def use_known_start_method() -> None:
-    """Let this process start others as a fresh one does. joblib's workers have a start method of
-    their own, by which data loaders cannot start."""
+    """Let this process start others as a fresh one does. joblib's workers have another start
+    method, by which data loaders cannot start."""
     known = multiprocessing.get_all_start_methods()  # the platform's default comes first
     if multiprocessing.get_start_method() not in known:
         multiprocessing.set_start_method(known[0], force=True)

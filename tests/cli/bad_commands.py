@@ -84,6 +84,7 @@ MISSPELT = [
         "install 'ghgs-lit[cluster]')",
     ),
     ("train +optimizer.lrr=1", 1, "optimizer", "lrr"),
+    ("train +sed=3", 1, "sed: expected one of allow_random_encoder"),
     ("train +seed=3", 1, "+seed=3: expected", "already at 'seed'"),
     ("train ~sed", 1, "sed: expected a value", "~sed"),
 ]

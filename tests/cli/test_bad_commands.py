@@ -14,13 +14,13 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
-from ghgs_lit.cli import main as cli
 from ghgs_lit.cli import messages
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from ghgs_people import datasets
 from tests.cli.bad_commands import ROWS
 from tests.helpers.models import config, make_model
 from tests.helpers.processes import start_verb
+from tests.helpers.verbs import ghgs
 
 
 @pytest.fixture(scope="module")
@@ -53,17 +53,12 @@ def call(monkeypatch, capfd, tmp_path, command: str) -> tuple[int, str]:
     """The exit code and the standard error of ``ghgs <command>`` in the folder ``tmp_path``."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr("sys.argv", ["ghgs", *shlex.split(command)])
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     # Rendering takes minutes, so all that can be checked is checked before.
     started = AssertionError("work started before all was checked")
     monkeypatch.setattr(datasets, "render_people", Mock(side_effect=started))
     GlobalHydra.instance().clear()
-    try:
-        code = cli.main()
-    except SystemExit as stop:
-        code = int(stop.code or 0)
+    code = ghgs(*shlex.split(command)) or 0
     out, err = capfd.readouterr()
     return code, err or out
 
@@ -169,12 +164,7 @@ def test_a_working_directory_that_is_gone(monkeypatch, capfd, tmp_path):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    for arguments, code in (
-        (["doctor", "task=machine"], 1),
-        (["train", "-m", "seed=1,2"], 1),
-        (["--help"], 0),
-    ):
-        monkeypatch.setattr("sys.argv", ["ghgs", *arguments])
-        assert cli.main() == code
-        expected = "ghgs: .: expected a working directory (cd to another); found No such file or directory\n"
+    expected = "ghgs: .: expected a working directory (cd to another); found No such file or directory\n"
+    for command, code in (("doctor task=machine", 1), ("train -m seed=1,2", 1), ("--help", 0)):
+        assert ghgs(*command.split()) == code
         assert capfd.readouterr().err == (expected if code else "")

@@ -59,17 +59,36 @@ def test_every_field_is_set_by_a_shipped_file():
     assert missing == []
 
 
+def nested_classes(cls):
+    yield cls
+    for field in cls.model_fields.values():
+        if (nested := options_of(field.annotation)) is not None:
+            yield from nested_classes(nested)
+
+
 def test_every_field_has_a_meaning():
-    """``ghgs <verb> --help <group>`` shows it."""
+    """``ghgs <verb> --help`` and ``ghgs <verb> --help <group>`` show it."""
+    for cls in [class_of(group, kind, group) for group, kind in TYPED] + [
+        verb_class(verb) for verb in verbs()
+    ]:
+        for each in nested_classes(cls):
+            assert set(each.model_fields) <= set(meanings(each)), each
 
-    def without(cls):
-        yield from (f"{cls.__name__}.{name}" for name in set(cls.model_fields) - set(meanings(cls)))
-        for field in cls.model_fields.values():
-            if (nested := options_of(field.annotation)) is not None:
-                yield from without(nested)
 
-    classes = [class_of(group, kind, group) for group, kind in TYPED]
-    assert sorted(name for cls in classes for name in without(cls)) == []
+#: Keys that must be given.
+GIVEN = {"export": ["checkpoint=a.ckpt"], "import": ["out=b.ckpt"], "table": ["runs=c"]}
+
+
+@pytest.mark.parametrize("verb", verbs())
+def test_yaml_and_options_of_a_verb_agree(verb):
+    """A default in two places that differ would be wrong in one of them."""
+    given = GIVEN.get(verb, [])
+    read = run_of(verb, given)
+    options = verb_class(verb)
+    assert {name for name in read.plain if name not in KINDS} == set(options.model_fields)
+    for name, field in options.model_fields.items():
+        if name not in {text.split("=")[0] for text in given}:
+            assert getattr(read, name) == field.get_default(call_default_factory=True), name
 
 
 #: Integers that need no limit, by the reason: no value hangs or takes all memory.
@@ -170,11 +189,3 @@ def test_an_unknown_key_is_refused_in_every_group(whole):
         key = f"{group}.{next(iter(config[group]))}" if group in NAMED else group
         with pytest.raises(InputError, match=rf"{key} key: expected (one of .*|no keys); found 'nonsense'"):
             read_nodes(with_value(config, f"{key}.nonsense", 1))
-
-
-def test_resolve_checks():
-    """Verbs, sweeps and saved configurations all go through ``resolve``."""
-    with pytest.raises(
-        InputError, match=r"data\.batch_size: expected an integer >= 1 and <= 1024; found 1\.5"
-    ):
-        run_of("train", ["data.batch_size=1.5"])

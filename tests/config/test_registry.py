@@ -6,7 +6,6 @@ import inspect
 import pkgutil
 from itertools import chain
 
-import numpy as np
 import pytest
 
 import ghgs_capture
@@ -61,7 +60,7 @@ def test_no_function_or_class_is_a_kind_by_its_path():
 
 
 @pytest.mark.parametrize("group", sorted(KINDS))
-def test_the_words_of_hydras_instantiate_mean_nothing(group, tmp_path):
+def test_keys_of_hydras_instantiate_have_no_effect(group, tmp_path):
     """At every node, and nested; what a file says is data."""
     verb = verb_with(group)
     node = composed(verb, *["model=recurrent", "logger=wandb"] * (verb == "train")).get(group)
@@ -82,7 +81,7 @@ def test_the_words_of_hydras_instantiate_mean_nothing(group, tmp_path):
 
 @pytest.mark.parametrize("stage", ["bounds", "encoder", "depth_head", "recalibration", "gaussian_head"])
 def test_a_model_is_built_of_kinds_alone(stage):
-    """The same through the door that checkpoints take."""
+    """The same for the nodes of a checkpoint."""
     settings = config()
     settings[stage] = {"_target_": "ghgs_lit.runs.job._run_process", "command": ["false"]}
     with pytest.raises(InputError, match=rf"{stage}\.kind: expected"):
@@ -122,7 +121,7 @@ def test_kinds_of_the_users_own(monkeypatch):
         register("shape", "sphere")(Sphere)
 
 
-def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
+def test_a_file_of_a_subpackage_registers_its_kinds(monkeypatch, tmp_path):
     """Another depth head is one file beside the others: no list names it."""
     (tmp_path / "flat.py").write_text(
         "from ghgs_lit.config import register\n"
@@ -133,7 +132,7 @@ def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
     monkeypatch.setattr("ghgs_lit.method.heads.__path__", [*ghgs_lit.method.heads.__path__, str(tmp_path)])
-    registry._import_room.cache_clear()
+    registry._import_subpackage.cache_clear()
     assert read_node({"kind": "flat", "metres": 3}, "depth_head").metres == 3.0
     assert registry.kinds_of("depth_head") == ["dpt", "flat"]
 
@@ -143,16 +142,3 @@ def test_a_node_without_a_kind_names_those_that_there_are():
         build({}, "bounds")
     with pytest.raises(InputError, match=r"bounds: expected a mapping of its keys; found 'box'"):
         build("box", "bounds")
-
-
-def test_a_node_is_read_once_and_taken_for_no_other():
-    """The order of cameras is that of the views; printed arrays leave out their middle."""
-    node = {"names": {"left": "a", "right": "b"}}
-    options = read_node(node, "calibration")
-    assert read_node(dict(node), "calibration") is options
-    turned = read_node({"names": {"right": "b", "left": "a"}}, "calibration")
-    assert (list(options.names), list(turned.names)) == (["left", "right"], ["right", "left"])
-    arrays = [np.zeros(2000), np.zeros(2000)]
-    arrays[1][1000] = 1
-    read = [read_node({"names": {"left": array}}, "calibration").names["left"] for array in arrays]
-    assert [array.sum() for array in read] == [0, 1]
