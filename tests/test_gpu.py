@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.precision import exact, has_bfloat16
-from ghgs_lit.runtime.watching import Results, watched
+from ghgs_lit.runtime.watching import Watcher, watched
 from tests.helpers.models import ATTRIBUTES, make_model
 from tests.helpers.scenes import make_batch
 from tests.helpers.splats import relative_error
@@ -22,6 +22,16 @@ LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0*
 #: a token to another neighbour; at least one of three models has no such jump.
 GRADIENT_LIMIT = 1e-2
 SEEDS = range(3)
+
+
+class Results(Watcher):
+    """The last result of each stage, by its name."""
+
+    def __init__(self):
+        self.results = {}
+
+    def end(self, stage, result=None):
+        self.results[stage] = result
 
 
 def double(batch):

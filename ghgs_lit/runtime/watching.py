@@ -145,13 +145,3 @@ class Stopwatch(Watcher):
         for stage, begin, stop in self._spans:
             total[stage] += seconds_between(begin, stop)
         return dict(total)
-
-
-class Results(Watcher):
-    """The last result of each stage, by its name."""
-
-    def __init__(self) -> None:
-        self.results: dict[str, Any] = {}
-
-    def end(self, stage: str, result: Any = None) -> None:
-        self.results[stage] = result

@@ -244,7 +244,12 @@ ENDLESS = [
 EARLY = [
     ("train evaluation.targets=[relase]", 1, "evaluation.targets: expected one of", "did you mean release?"),
     ("train evaluation.split=foo", 1, "evaluation.split: expected", "'foo'"),
-    ("train data.size=150", 1, "data.size: expected", "150"),
+    ("train data.size=150", 1, "data.size: expected sides divisible by the patch size 14 (or", "150"),
+    (
+        "evaluate data=synthetic baselines=[untrained] data.size=[140,150] device=cpu",
+        1,
+        "data.size: expected sides divisible by the patch size 14 (or model.pad=multiple); found [140, 150]",
+    ),
     ("train encoder.trainable=none", 1, "init_from", "ghgs import"),
     ("train hydra.run.dir={broken}/run", 1, "{broken}/run", "found metrics.json", "hydra.run.dir"),
     ("evaluate checkpoint={ckpt} data=synthetic device=cuda", 1, "device: expected", "cuda"),

@@ -1,5 +1,4 @@
-"""``ghgs prepare`` on data that is incomplete on purpose,
-and what is refused before anything is made."""
+"""``ghgs prepare`` on data that is incomplete on purpose."""
 
 import json
 
@@ -34,23 +33,3 @@ def test_data_without_training_people_can_be_made_and_evaluated(monkeypatch, cap
     cfg = compose("prepare", keys)
     data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
     assert next(iter(data.evaluation_loader())).subjects == ("s0",)
-
-
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ("train", "data.size=150", "encoder=vggt_nano"),
-        ("evaluate", "data=synthetic", "baselines=[untrained]", "data.size=[140,150]", "device=cpu"),
-    ],
-)
-def test_a_size_that_the_model_cannot_take_is_refused_before_rendering(monkeypatch, capsys, tmp_path, argv):
-    """data.size=150 with a patch of 14: no person is rendered first."""
-
-    def rendered(*_, **__):
-        raise AssertionError("rendered before the check")
-
-    monkeypatch.setattr("ghgs_people.datasets.render_people", rendered)
-    run = (f"data.cache_dir={tmp_path}", f"hydra.run.dir={tmp_path / 'run'}")
-    code, _, err = call(monkeypatch, capsys, *argv, *run)
-    assert code == 1
-    assert "data.size: expected sides divisible by the patch size 14 (or model.pad=multiple); found [1" in err
