@@ -217,16 +217,23 @@ def test_a_wrong_value_leaves_no_run(monkeypatch, capsys, tmp_path, arguments):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["empty", "run/notes.txt", "run/config.yaml"])
-def test_what_was_there_before_an_error_stays(tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("run", "train seed=abc"),
+        ("run/notes.txt", "table runs=nowhere"),
+        ("run/config.yaml", "predict images=nowhere cameras=nowhere.json"),
+    ],
+)
+def test_what_was_there_before_an_error_stays(tmp_path, name, command):
     """Also an empty folder, and a file of a run that was trained earlier."""
-    file = tmp_path / name
-    file.parent.mkdir(exist_ok=True)
-    file.mkdir() if name == "empty" else file.write_text("seed: 1")
-    os.utime(file, (1.0, 1.0))
-    folder = file if name == "empty" else file.parent
-    assert ghgs("table", "runs=nowhere", f"hydra.run.dir={folder}") == 1
-    assert file.exists()
+    path, run = tmp_path / name, tmp_path / "run"
+    run.mkdir()
+    if path != run:
+        path.write_text("seed: 1")
+    os.utime(path, (1.0, 1.0))
+    assert ghgs(*command.split(), f"hydra.run.dir={run}") == 1
+    assert path.exists()
 
 
 def test_hydras_files_are_written_and_through_no_link(tmp_path, monkeypatch, capsys):
