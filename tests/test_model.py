@@ -1,6 +1,5 @@
 """The whole model: numbers of the release, invariances, skipping, refusals."""
 
-import dataclasses
 import operator
 import subprocess
 import sys
@@ -178,26 +177,6 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
             assert parameter.grad.isfinite().all(), name
 
 
-@pytest.mark.parametrize(("size", "views"), [((56, 56), 2), ((28, 70), 3), ((42, 28), 5)])
-def test_shapes(size, views):
-    """Any number of views and any shape must give complete maps."""
-    batch = make_batch(1, views, *size)
-    prediction = predict(make_model(), batch)
-    assert prediction.depth.shape == prediction.depth_valid.shape == batch.masks.shape
-    assert prediction.points.pixels.shape == (*batch.masks.shape, 3)
-    assert prediction.gaussians.splits == (batch.masks.sum().item(),)
-
-
-def test_a_view_with_an_empty_mask_gives_no_gaussians():
-    """A view without the subject must give nothing, and no NaN."""
-    batch = make_batch(1, 3)
-    masks = batch.masks.clone()
-    masks[0, 1] = False
-    gaussians = predict(make_model(), dataclasses.replace(batch, masks=masks)).gaussians
-    assert set(gaussians.image.tolist()) == {0, 2}
-    assert gaussians.means.isfinite().all()
-
-
 def test_ablations_differ_and_say_what_they_leave_out():
     """An ablation that changes nothing would make a wrong table."""
     batch = make_batch(1, 3)
@@ -243,27 +222,6 @@ def test_order_of_later_views_does_not_matter(skip, ablation):
         a, b = (predict(model, in_dtype(x, torch.float64)).gaussians for x in (batch, swapped))
     parts = [(b.image == i).nonzero()[:, 0] for i in (0, 2, 3, 1)]
     close(a, b.select(torch.cat(parts), b.splits), 2e-5)
-
-
-def test_geometry_is_wide_under_autocast():
-    """Depths and points in half precision would be off by centimetres."""
-    batch = make_batch(1, 3)
-    model = make_model("model=hull")
-    with torch.autocast("cpu", torch.bfloat16):
-        prediction = predict(model, batch)
-    expected = predict(model, batch)
-    assert prediction.depth.dtype == prediction.points.pixels.dtype == prediction.gaussians.means.dtype
-    assert prediction.depth.dtype == torch.float32
-    assert torch.equal(prediction.depth_maps.bounds.near, expected.depth_maps.bounds.near)
-    depth = expected.depth[batch.masks]
-    # Tokens are rounded, and move a depth within its bounds; a rounded depth is off by 8 mm.
-    assert (prediction.depth[batch.masks] - depth).abs().max() < (depth.bfloat16() - depth).abs().max() / 2
-    again = Unprojection()(
-        prediction.depth_maps,
-        model.encoder(batch.images, batch.masks, model.bounds(batch)),
-        batch,
-    )
-    torch.testing.assert_close(again.pixels, prediction.points.pixels, rtol=0, atol=2e-6)
 
 
 def test_a_missing_stage_and_a_bad_value_name_their_key():

@@ -91,17 +91,6 @@ def test_semantic_features_carry_no_gradient():
     assert tokens.latent[0].requires_grad
 
 
-@pytest.mark.parametrize(("trainable", "pairs"), [("none", 0), ("last_1", 1), ("all", 2)])
-def test_trainable_part(trainable, pairs):
-    """Exactly the named blocks may be trained."""
-    encoder = _encoder(trainable=trainable)
-    for blocks in (encoder.aggregator.frame_blocks, encoder.aggregator.global_blocks):
-        trained = [all(p.requires_grad for p in block.parameters()) for block in blocks]
-        assert trained == [False] * (2 - pairs) + [True] * pairs
-    assert encoder.aggregator.camera_token.requires_grad is (trainable == "all")
-    assert encoder(*_views(1, 2, 28, 28)).latent[1].requires_grad is (pairs > 0)
-
-
 def test_low_precision_stays_near_float32():
     """Angles, norms and the residual stream are wide: bfloat16 loses what its products lose,
     no more."""
