@@ -25,7 +25,7 @@ BETTER = 0.05
 #: and how much of the disagreement it may leave.
 _SOUND = 0.97
 _REST = 1 / 3
-_SAME = 0.01  # Difference of agreement that tells nothing
+_SAME = 0.01  # Insignificant difference of agreement
 _SIDE = 320  # Longer side of the photographs that are compared, in pixels
 _MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
 # Usual factors of a resize after the calibration.
@@ -56,7 +56,7 @@ class StoredView:
 class Hypothesis:
     """A meaning of a calibration, and how well masks and cameras agree with it."""
 
-    says: str
+    meaning: str
     option: str  #: of the command line, for this meaning; empty: none
     views: tuple[StoredView, ...]
     blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
@@ -89,7 +89,7 @@ class Hypothesis:
             folder: where the views come from.
         """
         try:
-            shares = HullSearch().shares(_silhouettes(self.photographs(folder)))
+            shares = HullSearch().shares(_make_silhouettes(self.photographs(folder)))
         except (InputError, np.linalg.LinAlgError):
             shares = [0.0] * len(self.views)
         return replace(self, shares={v.name: share for v, share in zip(self.views, shares, strict=True)})
@@ -122,36 +122,36 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     Raises:
         InputError: a file cannot be read.
     """
-    views = small_views(folder, folder.instants[0] if instant is None else instant)
+    views = read_small_views(folder, folder.instants[0] if instant is None else instant)
     given = Hypothesis("the calibration is right as it is", "", views).scored(folder)
     same = twins({view.name: view.camera.pose for view in views})
     if same is None and given.score > 0:
-        same = copies(given.photographs(folder))
+        same = find_copies(given.photographs(folder))
     if same is not None:
         line = f"{' and '.join(same)} have the same pose, or are the same photograph: one of them is a copy"
         return Diagnosis(False, (line,), given, same)
     if given.score >= AGREES:
         agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
-        lines = [f"cameras and masks agree ({agree})", _size_line(given, folder)]
-        suspects, line = _suspects(given, folder) if given.score < _SOUND else ((), "")
+        lines = [f"cameras and masks agree ({agree})", _describe_size(given, folder)]
+        suspects, line = _find_suspects(given, folder) if given.score < _SOUND else ((), "")
         return Diagnosis(True, (*lines, line) if suspects else tuple(lines), given, suspects)
-    tried = [given, *(hypothesis.scored(folder) for hypothesis in _for_all(views))]
+    tried = [given, *(hypothesis.scored(folder) for hypothesis in _reinterpret_all(views))]
     base = best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score <= given.score + BETTER:
         base = given
     if best.score < AGREES:
         # A single wrong camera is sought with the best meaning for all.
-        tried += [hypothesis.scored(folder) for hypothesis in _for_some(base.views)]
+        tried += [hypothesis.scored(folder) for hypothesis in _correct_some(base.views)]
         best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < max(AGREES, given.score + BETTER):
-        suspects, line = _suspects(base, folder)
+        suspects, line = _find_suspects(base, folder)
         return Diagnosis(False, (line,), best, suspects)
-    line = f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"
+    line = f"{best.meaning}: masks agree by {best.score:.0%} instead of {given.score:.0%}"
     lines = [line, f"try {best.option}"] if best.option else [line]
-    return Diagnosis(False, (*lines, _size_line(best, folder)), best, best.blames)
+    return Diagnosis(False, (*lines, _describe_size(best, folder)), best, best.blames)
 
 
-def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
+def read_small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
     """Decode the photographs of an instant, so small that many meanings can be tried.
 
     Args:
@@ -180,7 +180,7 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
     return tuple(views)
 
 
-def in_parts(views: Sequence[StoredView]) -> list[str]:
+def find_parted_masks(views: Sequence[StoredView]) -> list[str]:
     """Find masks that have a second large part, as two people have.
 
     Args:
@@ -200,7 +200,7 @@ def in_parts(views: Sequence[StoredView]) -> list[str]:
     return names
 
 
-def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
+def find_copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
     """Find two photographs that are the same picture, also if stored with losses.
 
     Args:
@@ -220,13 +220,13 @@ def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
     return None
 
 
-def _silhouettes(photographs: Sequence[Photograph]) -> list[Silhouette]:
+def _make_silhouettes(photographs: Sequence[Photograph]) -> list[Silhouette]:
     return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
 
 
-def _size_line(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
+def _describe_size(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
     """The subject's largest extent in the user's unit, and the option that makes it metres."""
-    silhouettes = _silhouettes(hypothesis.photographs(folder))
+    silhouettes = _make_silhouettes(hypothesis.photographs(folder))
     focus, _ = subject_sphere(silhouettes)
     size = float(np.median([silhouette.extent(focus).max() for silhouette in silhouettes]))
     if PERSON[0] <= size <= PERSON[1]:
@@ -238,7 +238,7 @@ def _size_line(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
     return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
 
 
-def _suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple[str, ...], str]:
+def _find_suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple[str, ...], str]:
     """The views that explain by themselves most of the disagreement, and a line about it.
 
     A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it:
@@ -250,7 +250,7 @@ def _suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple[str,
         score = replace(hypothesis, views=rest).scored(folder).score
         if score >= least:
             fitting[left_out.name] = score
-    readings = {name: _reading(hypothesis, name) for name in fitting}
+    readings = {name: _describe_fault(hypothesis, name) for name in fitting}
     if len(hypothesis.views) == 3 and any(readings.values()):  # two views alone agree nearly always
         fitting = {name: score for name, score in fitting.items() if readings[name]}
     if not fitting:
@@ -265,7 +265,7 @@ def _suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple[str,
     return names, line + (readings[names[0]] if len(names) == 1 else "")
 
 
-def _reading(hypothesis: Hypothesis, name: str) -> str:
+def _describe_fault(hypothesis: Hypothesis, name: str) -> str:
     """What may be wrong with a view, by whether its own mask or those of the others lie
     outside a hull."""
     own = 1 - hypothesis.shares[name]
@@ -277,7 +277,7 @@ def _reading(hypothesis: Hypothesis, name: str) -> str:
     return ""
 
 
-def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+def _reinterpret_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     """Other meanings of all cameras: what poses map, axes, unit of the intrinsics, a resize, and
     EXIF turns."""
     given = views[0].convention
@@ -296,12 +296,12 @@ def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
         changed = tuple(replace(view, convention=convention) for view in read)
         if convention == given or not all(map(_is_plausible, changed)):
             continue
-        said = []
+        changes = []
         for key, value in vars(convention).items():
             if value != getattr(given, key):
-                said.append(f"{key}={value if isinstance(value, str) else f'{value:.4g}'}")
-        option = " ".join(f"calibration.{each}" for each in said)
-        yield Hypothesis(f"all cameras: {', '.join(said)}", option, changed)
+                changes.append(f"{key}={value if isinstance(value, str) else f'{value:.4g}'}")
+        option = " ".join(f"calibration.{each}" for each in changes)
+        yield Hypothesis(f"all cameras: {', '.join(changes)}", option, changed)
 
 
 def _is_plausible(view: StoredView) -> bool:
@@ -313,12 +313,12 @@ def _is_plausible(view: StoredView) -> bool:
     return bool(((share >= _MIDDLE[0]) & (share <= _MIDDLE[1])).all())
 
 
-def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+def _correct_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     """Mistakes of one camera, and cameras or masks that are exchanged, which look alike to the hull."""
     for i, view in enumerate(views):
-        for says, changed in _mistakes(view):
+        for mistake, changed in _correct_one(view):
             mended = (*views[:i], changed, *views[i + 1 :])
-            yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
+            yield Hypothesis(f"{view.name} alone: {mistake}", "", mended, (view.name,))
     orders = [views[1:] + views[:1], views[-1:] + views[:-1]] if len(views) > 2 else []
     for i, j in itertools.combinations(range(len(views)), 2):
         order = list(views)
@@ -343,18 +343,18 @@ def _fit_better(pairs: Sequence[tuple[StoredView, StoredView]]) -> bool:
     """Whether outlines of the masks follow edges of the other photographs rather than of their own."""
     if any(view.mask.shape != other.mask.shape for view, other in pairs):
         return False
-    own = math.prod(_contrast(view, view.mask) for view, _ in pairs)
-    return math.prod(_contrast(view, other.mask) for view, other in pairs) > own
+    own = math.prod(_measure_contrast(view, view.mask) for view, _ in pairs)
+    return math.prod(_measure_contrast(view, other.mask) for view, other in pairs) > own
 
 
-def _contrast(view: StoredView, mask: np.ndarray) -> float:
+def _measure_contrast(view: StoredView, mask: np.ndarray) -> float:
     """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
     outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
     gradient = np.hypot(*np.gradient(view.pixels.image.mean(-1)))
     return float(gradient[outline].mean()) if outline.any() else 0.0
 
 
-def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
+def _correct_one(view: StoredView) -> Iterator[tuple[str, StoredView]]:
     """Usual mistakes of a single camera in words, each with the view after mending it."""
     given = view.convention
     for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
@@ -362,16 +362,16 @@ def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
         if convention != given:
             yield f"its extrinsics are {extrinsics} with axes of {axes}", replace(view, convention=convention)
     camera = view.camera
-    for factor, says in ((0.001, "long"), (1000.0, "short")):
+    for factor, length in ((0.001, "long"), (1000.0, "short")):
         pose = camera.pose * [[1.0, 1.0, 1.0, factor]]
         pose[3] = camera.pose[3]
-        yield f"its translation is 1000 times too {says}", replace(view, camera=replace(camera, pose=pose))
+        yield f"its translation is 1000 times too {length}", replace(view, camera=replace(camera, pose=pose))
     middle = camera.intrinsics.copy()
     sides = np.array(camera.size)[::-1] if given.intrinsics == "pixels" else 1.0
     middle[:2, 2] = sides / 2 / given.resized
     lenses = {"its principal point should be near the middle": middle}
     for factor in (0.5, 2.0):
-        says = f"its intrinsics are for photographs {1 / factor:g} times as large"
-        lenses[says] = camera.intrinsics * [[factor], [factor], [1.0]]
-    for says, intrinsics in lenses.items():
-        yield says, replace(view, camera=replace(camera, intrinsics=intrinsics))
+        mistake = f"its intrinsics are for photographs {1 / factor:g} times as large"
+        lenses[mistake] = camera.intrinsics * [[factor], [factor], [1.0]]
+    for mistake, intrinsics in lenses.items():
+        yield mistake, replace(view, camera=replace(camera, intrinsics=intrinsics))

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ghgs_capture.formats.colmap import model_folder, read_colmap
+from ghgs_capture.formats.colmap import find_model, read_colmap
 from ghgs_capture.formats.entries import CameraFile
-from ghgs_capture.formats.matrices import EASYMOCAP, QUALISYS, read_mapping, read_matrices, yaml_files
+from ghgs_capture.formats.matrices import EASYMOCAP, QUALISYS, list_yaml, read_mapping, read_matrices
 from ghgs_capture.formats.nerfstudio import read_nerfstudio
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.parsing import find_path
@@ -63,9 +63,9 @@ def _candidates(path: Path) -> Iterator[tuple[str, Path]]:
     if path.is_dir():
         if find_path(path, EASYMOCAP[0]) is not None:
             yield "easymocap", path
-        if model_folder(path) is not None:
+        if find_model(path) is not None:
             yield "colmap", path
-        if yaml_files(path):
+        if list_yaml(path):
             yield "opencv", path
         if (transforms := find_path(path, "transforms.json")) is not None:
             yield "nerfstudio", transforms
@@ -78,5 +78,5 @@ def _candidates(path: Path) -> Iterator[tuple[str, Path]]:
         yield "nerfstudio" if "frames" in read_mapping(path)[0] else "ghgs", path
     elif name.endswith((".yml", ".yaml", ".toml", QUALISYS)):
         yield "opencv", path
-    elif name.endswith((".bin", ".txt")) and model_folder(path.parent) is not None:
+    elif name.endswith((".bin", ".txt")) and find_model(path.parent) is not None:
         yield "colmap", path

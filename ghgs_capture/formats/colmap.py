@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.formats.entries import CameraFile, Entries, pinhole
-from ghgs_capture.formats.matrices import camera_of
+from ghgs_capture.formats.matrices import read_camera
 from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.parsing import require_file
 
@@ -23,7 +23,7 @@ _MODELS = {
 _FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
-def model_folder(path: Path) -> Path | None:
+def find_model(path: Path) -> Path | None:
     """Find a sparse model.
 
     Args:
@@ -52,13 +52,13 @@ def read_colmap(path: Path) -> CameraFile:
         InputError: the model cannot be read, pycolmap is not installed, or a camera model is not
             known.
     """
-    folder = model_folder(path if path.is_dir() else path.parent)
+    folder = find_model(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
     pycolmap = installed("pycolmap", "colmap", str(path))
     for file in folder.iterdir():
         if file.stem in _FILES:
             require_file(file, "a file of a COLMAP model")
-    names = _names(folder)
+    names = _read_names(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
         images = [image for image in model.images.values() if image.has_pose]
@@ -66,13 +66,13 @@ def read_colmap(path: Path) -> CameraFile:
         raise InputError(f"{folder}: expected a COLMAP model; found {error}") from error
     require(bool(images), str(folder), "photographs with a pose", "none")
     cameras = [
-        _camera(folder, names.get(image.image_id, image.name), image, model.cameras[image.camera_id])
+        _make_camera(folder, names.get(image.image_id, image.name), image, model.cameras[image.camera_id])
         for image in images
     ]
     return CameraFile.of(cameras, Convention())
 
 
-def _names(folder: Path) -> dict[int, str]:
+def _read_names(folder: Path) -> dict[int, str]:
     """Names of photographs in ``images.txt`` by id; COLMAP's own reader cuts them at a space."""
     path = folder / "images.txt"
     if (folder / "images.bin").exists() or not path.exists():
@@ -84,7 +84,7 @@ def _names(folder: Path) -> dict[int, str]:
     return {int(fields[0]): fields[9].rstrip() for fields in images if fields[0].isdecimal()}
 
 
-def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
+def _make_camera(folder: Path, name: str, image, camera) -> StoredCamera:
     """One registered photograph's camera.
 
     Args:
@@ -108,4 +108,4 @@ def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
     lens = pinhole(*(values.pop(name) for name in ("fx", "fy", "cx", "cy")))
     pose = image.cam_from_world().matrix()
     fields = {"K": lens, "R": pose[:, :3], "T": pose[:, 3], "size": [camera.width, camera.height]}
-    return camera_of(name, Entries(origin, {**fields, **values, "fisheye": "FISHEYE" in model}))
+    return read_camera(name, Entries(origin, {**fields, **values, "fisheye": "FISHEYE" in model}))

@@ -69,7 +69,7 @@ def plain(key: str) -> str:
     return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, str(key).lower())))
 
 
-def _finite(place: str, value: Any) -> float:
+def _read_number(place: str, value: Any) -> float:
     """An entry as a number; text that spells a number is one."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
@@ -79,13 +79,13 @@ def _finite(place: str, value: Any) -> float:
     return number
 
 
-def _true_or_false(place: str, value: Any) -> bool:
+def _read_flag(place: str, value: Any) -> bool:
     is_flag = isinstance(value, bool | int | float) and value in (0, 1)
     require(is_flag, place, "true or false", value)
     return bool(value)
 
 
-def _text(place: str, value: Any) -> str:
+def _read_text(place: str, value: Any) -> str:
     require(isinstance(value, str), place, "text", value)
     return value
 
@@ -113,15 +113,15 @@ class Entries:
 
     def number(self, what: str) -> float | None:
         """A finite number."""
-        return self._value(what, _finite)
+        return self._value(what, _read_number)
 
     def flag(self, what: str) -> bool | None:
         """True or false, also as 1 or 0; anything else, such as the text "no", is refused."""
-        return self._value(what, _true_or_false)
+        return self._value(what, _read_flag)
 
     def text(self, what: str) -> str | None:
         """Text; None also where it is empty."""
-        return self._value(what, _text) or None
+        return self._value(what, _read_text) or None
 
     def has(self, what: str, *shapes: tuple[int | None, ...]) -> bool:
         """Whether there is an array of one of several shapes; None is any length of an axis."""
@@ -313,7 +313,7 @@ class CameraFile:
         for part in (-1, -2, 0):
             named: dict[str, StoredCamera] = {}
             for camera in cameras:
-                name = _parts(camera.name)[part:][0] if part else composed(camera.name)
+                name = _split_name(camera.name)[part:][0] if part else composed(camera.name)
                 if name not in named:
                     named[name] = camera
                 elif named[name].has_numbers_of(camera):
@@ -325,7 +325,7 @@ class CameraFile:
         raise InputError(f"{camera.origin}: expected cameras of different names; found {name} twice")
 
 
-def _parts(name: str) -> list[str]:
+def _split_name(name: str) -> list[str]:
     *folders, last = parts_of(name)
     path = Path(last)
     suffix = path.suffix.lower()

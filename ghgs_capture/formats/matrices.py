@@ -39,7 +39,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
+def _construct_matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
     """The node ``{rows, cols, dt, data}``, or ``{sizes, dt, data}`` as OpenCV 5 writes arrays
     of one axis."""
     fields = loader.construct_mapping(node, deep=True)
@@ -48,16 +48,16 @@ def _matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
 
 
 for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _matrix)
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _construct_matrix)
 
 
-def _yaml(text: str) -> Any:
+def _parse_yaml(text: str) -> Any:
     text = re.sub(r"\A%YAML[^\n]*\n", "", text)  # OpenCV's "%YAML:1.0" is no directive of YAML
     check_yaml(text)
     return yaml.load(text, _Loader)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _require_unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [key for key, _ in pairs]
@@ -65,11 +65,11 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def _json(text: str) -> Any:
-    return json.loads(text, object_pairs_hook=_once)
+def _parse_json(text: str) -> Any:
+    return json.loads(text, object_pairs_hook=_require_unique_keys)
 
 
-def _qualisys(text: str) -> dict[str, Any]:
+def _parse_qualisys(text: str) -> dict[str, Any]:
     """Cameras of Qualisys by serial number, with OpenCV's names: its pose maps the camera to
     the world."""
     cameras = {}
@@ -101,14 +101,14 @@ def _qualisys(text: str) -> dict[str, Any]:
 
 #: By ending: the parser, what the file should be, and the meaning of its numbers.
 _KINDS = {
-    ".json": (_json, "JSON", Convention(pixel_centers="integer")),
+    ".json": (_parse_json, "JSON", Convention(pixel_centers="integer")),
     ".toml": (tomllib.loads, "TOML", Convention(pixel_centers="integer")),
     QUALISYS: (
-        _qualisys,
+        _parse_qualisys,
         "cameras of Qualisys",
         Convention(axes="opengl", pixel_centers="integer", unit=0.001),
     ),
-    "": (_yaml, "YAML of OpenCV", Convention(pixel_centers="integer")),
+    "": (_parse_yaml, "YAML of OpenCV", Convention(pixel_centers="integer")),
 }
 
 
@@ -131,7 +131,7 @@ def read_mapping(path: Path) -> tuple[dict[str, Any], Convention]:
     return content, convention
 
 
-def yaml_files(folder: Path) -> list[Path]:
+def list_yaml(folder: Path) -> list[Path]:
     """The YAML files of a folder, sorted by name.
 
     Args:
@@ -159,8 +159,8 @@ def read_matrices(path: Path) -> CameraFile:
     """
     cameras: list[StoredCamera] = []
     unread: list[str] = []
-    for file, content, convention in _contents(path):
-        named = _by_name(file, content)
+    for file, content, convention in _read_contents(path):
+        named = _list_cameras(file, content)
         own = {}
         if file.suffix.lower() == ".json":
             own = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
@@ -168,21 +168,21 @@ def read_matrices(path: Path) -> CameraFile:
         read = own or {name: camera for name, camera in named.items() if _has_intrinsics(camera)}
         others = {name: camera for name, camera in named.items() if name not in read}
         if not read:
-            read, others = _by_suffix(content)
+            read, others = _split_by_suffix(content)
         expected = "cameras with intrinsics and extrinsics (or K, R and T)"
         require(bool(read), str(file), expected, sorted(content))
-        cameras += [camera_of(name, Entries(f"{file}: {name}", camera)) for name, camera in read.items()]
+        cameras += [read_camera(name, Entries(f"{file}: {name}", camera)) for name, camera in read.items()]
         for fields in (others, content if "cameras" in content else {}):
             unread += Entries(str(file), fields).unread()
     return CameraFile.of(cameras, convention, unread)
 
 
-def _contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Convention]]:
+def _read_contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Convention]]:
     """Files with the mappings in them; EasyMocap's two are one."""
     folder = path if path.is_dir() else path.parent
     is_pair = find_path(folder, EASYMOCAP[0]) is not None if path.is_dir() else path.name.lower() in EASYMOCAP
     if not is_pair:
-        for file in yaml_files(path) if path.is_dir() else [path]:
+        for file in list_yaml(path) if path.is_dir() else [path]:
             yield file, *read_mapping(file)
         return
     fields: dict[str, Any] = {}
@@ -194,7 +194,7 @@ def _contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Convention]]:
     yield folder, fields, convention
 
 
-def _by_name(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+def _list_cameras(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
     """What may be cameras by name: the file itself, those of the entry ``cameras`` (a mapping or a
     list), or all entries; tables of TOML are named by their key ``name``."""
     if _has_intrinsics(content):
@@ -213,7 +213,7 @@ def _by_name(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
     return named
 
 
-def _by_suffix(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+def _split_by_suffix(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01;
     and the other entries."""
     cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
@@ -231,7 +231,7 @@ def _has_intrinsics(fields: Any) -> bool:
     return isinstance(fields, Mapping) and bool(Entries("", fields).keys("intrinsics"))
 
 
-def camera_of(name: str, entries: Entries) -> StoredCamera:
+def read_camera(name: str, entries: Entries) -> StoredCamera:
     """One camera with matrices under any usual names; a rotation is a matrix or a vector.
 
     Args:
@@ -246,7 +246,7 @@ def camera_of(name: str, entries: Entries) -> StoredCamera:
         extrinsics = entries.needed("extrinsics", (4, 4), (3, 4))
         pose[: len(extrinsics)] = extrinsics
     else:
-        pose[:3, :3] = _rotation(entries)
+        pose[:3, :3] = _read_rotation(entries)
         pose[:3, 3] = entries.needed("translation", *_VECTORS).ravel()
     intrinsics = entries.needed("intrinsics", (3, 3))
     fisheye = entries.is_fisheye
@@ -263,7 +263,7 @@ def camera_of(name: str, entries: Entries) -> StoredCamera:
     )
 
 
-def _rotation(entries: Entries) -> np.ndarray:
+def _read_rotation(entries: Entries) -> np.ndarray:
     """A matrix is preferred to a vector, which then counts as read."""
     vector = entries.array("rotation", *_VECTORS) if entries.has("rotation", *_VECTORS) else None
     if vector is None or entries.has("rotation", (3, 3)):

@@ -39,12 +39,12 @@ def read_nerfstudio(path: Path) -> CameraFile:
     content, _ = read_mapping(path)
     frames = content.get("frames")
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
-    cameras = [_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]
+    cameras = [_read_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]
     convention = Convention(extrinsics="camera_to_world", axes="opengl")
     return CameraFile.of(cameras, convention)
 
 
-def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
+def _read_camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
     """The camera of one frame.
 
     Args:
@@ -67,7 +67,7 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     pose = entries.needed("transform_matrix", (4, 4), (3, 4))
     size = entries.size
     fisheye = entries.is_fisheye
-    lens = _lens(entries)
+    lens = _read_lens(entries)
     is_known = size is not None or lens.is_known
     return StoredCamera(
         photograph,
@@ -83,7 +83,7 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     )
 
 
-def _lens(entries: Entries) -> PartialIntrinsics:
+def _read_lens(entries: Entries) -> PartialIntrinsics:
     """What the entries say of intrinsics.
 
     Raises:

@@ -80,7 +80,7 @@ def check_cameras(folder: CaptureFolder) -> None:
     Raises:
         InputError: they contradict each other in all of these, or the only instant cannot be read.
     """
-    from ghgs_capture.camera_report import diagnose, in_parts
+    from ghgs_capture.camera_report import diagnose, find_parted_masks
     from ghgs_capture.rig import spread
 
     several = len(folder.instants) > 1
@@ -93,7 +93,7 @@ def check_cameras(folder: CaptureFolder) -> None:
                 raise
             continue
         diagnoses.append(diagnosis)
-        parts = in_parts(diagnosis.best.views)
+        parts = find_parted_masks(diagnosis.best.views)
         if len(parts) > 1:
             print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
         if several and not diagnosis.consistent:

@@ -91,7 +91,7 @@ def loop(place, name):
 FRAME = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
 NARROW = json.dumps({"fl_x": 90, "cx": 48, "cy": 64, "w": 0, "h": 128, "frames": [FRAME]})
 LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in pairwise(ascii_lowercase))
-SKEWED = (np.array(Figure().cameras["cam1"]["extrinsics"]) * 1.1).tolist()
+POSE = np.array(Figure().cameras["cam1"]["extrinsics"])
 WIDE = np.zeros((128, 128, 3), np.uint8)
 
 # What is wrong with the folder (a function that may return options), and parts of the line.
@@ -151,7 +151,19 @@ BAD = {
         "cam1",
         "finite numbers",
     ),
-    "no rotation": (lambda p: camera(p, extrinsics=SKEWED), "cam1: rotation: expected", "found"),
+    "no rotation": (
+        lambda p: camera(p, extrinsics=(1.1 * POSE).tolist()),
+        "cam1: rotation: expected",
+        "found",
+    ),
+    **{
+        f"mirrored axis {axis}": (
+            lambda p, signs=signs: camera(p, extrinsics=(POSE * signs).tolist()),
+            "cam1: rotation: expected a rotation",
+            "found a mirrored axis in",
+        )
+        for axis, signs in enumerate(1.0 - 2.0 * np.eye(3, 4)[:, None])
+    },
     "three coefficients": (lambda p: camera(p, distortion=[1, 2, 3]), "cam1: expected 0, 4, 5", "found 3"),
     "a flag that is text": (
         lambda p: camera(p, fisheye="no"),

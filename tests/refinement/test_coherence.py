@@ -82,12 +82,14 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
     )
 
 
-def test_exact_cameras_stay():
-    """To the bit: silhouettes that explain one another say nothing."""
-    truth = figure()
-    found, _, _ = coherent_cameras(truth)
+@pytest.mark.parametrize("shared", [False, True])
+def test_exact_cameras_stay(shared):
+    """To the bit: silhouettes that explain one another give no reason to move; alone and as a rig."""
+    truth = instants() if shared else figure()
+    found, _, distance = coherent_cameras(truth, shared=shared)
     assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
     assert torch.equal(found.intrinsics, truth.cameras.intrinsics)
+    assert (distance < 5e-4).all()
 
 
 def second_is_off(pixels):
@@ -347,10 +349,3 @@ def test_instants_of_one_rig_move_its_cameras_alike_and_tell_more_than_one():
     before, together, each = (corners_off(c, truth.cameras) for c in (wrong.cameras, found, alone))
     assert together < 0.5 * before
     assert together < 0.85 * each
-
-
-def test_instants_of_exact_cameras_leave_them():
-    truth = instants()
-    found, _, distance = coherent_cameras(truth, shared=True)
-    assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
-    assert (distance < 5e-4).all()
