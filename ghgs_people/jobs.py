@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -258,20 +258,19 @@ def render_people(
             todo += [(phase, name) for name in notes.missing(phase, listed)]
         render = functools.partial(render_person, source, rig, settings, seed)
         folders = [workspaces / f"{phase}-{name}" for phase, name in todo]
-        reasons = _map(render, folders, [name for _, name in todo], workers)
+        results = _map(render, folders, [name for _, name in todo], workers)
         progress = {"total": len(todo), "console": Console(stderr=True), "disable": not shown}
         bad = []
         try:
-            for (phase, name), why in zip(
-                todo, track(reasons, f"rendering into {root}", **progress), strict=True
-            ):
+            for index, why in track(results, f"rendering into {root}", **progress):
+                phase, name = todo[index]
                 if why:
                     bad.append(why)
                     log.warning("%s is not rendered: %s", name, why)
                 else:
-                    _publish(notes, phase, name, workspaces / f"{phase}-{name}")
+                    _publish(notes, phase, name, folders[index])
         finally:
-            reasons.close()
+            results.close()
             shutil.rmtree(workspaces, ignore_errors=True)
     if bad:
         raise InputError(f"{min(bad)} ({len(bad)} of {len(todo)} people are bad; the others are rendered)")
@@ -329,12 +328,12 @@ def _publish(notes: Completeness, phase: str, name: str, workspace: Path) -> Non
 
 def _map(
     render: Callable[[Path, str], str], folders: list[Path], names: list[str], workers: int | None
-) -> Iterator[str]:
-    """Results of ``render`` in the order of people, from ``workers`` processes (None: one for each core;
-    0 or 1: only this one)."""
+) -> Iterator[tuple[int, str]]:
+    """Positions and results of ``render`` as they are done, from ``workers`` processes (None: one for each
+    core; 0 or 1: only this one)."""
     workers = min(len(names), allowed_cores() if workers is None else workers)
     if workers < 2:
-        yield from map(render, folders, names)
+        yield from enumerate(map(render, folders, names))
         return
     compile_kernels()  # before the workers would, each for itself
     use_known_start_method()
@@ -343,12 +342,16 @@ def _map(
         mock.patch.dict(os.environ, _ONE_THREAD),
         ProcessPoolExecutor(workers, context, initializer=start_worker) as pool,
     ):
+        futures = {pool.submit(render, *each): i for i, each in enumerate(zip(folders, names, strict=True))}
         try:
-            yield from pool.map(render, folders, names)
+            for future in as_completed(futures):
+                yield futures[future], future.result()
         except BrokenProcessPool as error:
             raise RuntimeError(
                 f"a rendering process died: the script lacks `{_GUARD}`, or memory ran out (repeat to go on)"
             ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def start_worker() -> None:

@@ -137,7 +137,7 @@ def steps_of_tensorboard(folder: Path, name: str) -> list[int]:
 
 def curves_of(sweep: Path, run: Path) -> Path:
     identity = json.loads((run / "run.json").read_text())["id"]
-    owners = [path.parent for path in sweep.glob("tensorboard/*/.run") if path.read_text() == identity]
+    owners = [path.parent for path in sweep.glob("tb/*/.run") if path.read_text() == identity]
     return owners[0] if owners else run / "tensorboard"
 
 
