@@ -89,11 +89,6 @@ def _workers(count: int) -> ThreadPoolExecutor:
         return _pool
 
 
-def is_supported(*tensors: Tensor) -> bool:
-    """Whether float32 kernels, which read tensors as NumPy arrays, can work on these."""
-    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
-
-
 def have_values(*tensors: Tensor) -> bool:
     """Whether NumPy can read these, unlike PyTorch's FakeTensors."""
     return all(type(x) in (Tensor, nn.Parameter) for x in tensors)
@@ -110,8 +105,13 @@ def features() -> set[str]:
 
 def multiplies(*tensors: Tensor) -> bool:
     """Whether kernels compute products of these faster than PyTorch: float32 on a CPU with AVX2."""
-    readable = is_supported(*tensors) and have_values(*tensors)
-    return readable and not torch.is_autocast_enabled("cpu") and features() >= {"avx2", "fma"}
+    supported = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    return (
+        supported
+        and have_values(*tensors)
+        and not torch.is_autocast_enabled("cpu")
+        and features() >= {"avx2", "fma"}
+    )
 
 
 def run_rows(

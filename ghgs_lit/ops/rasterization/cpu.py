@@ -211,27 +211,18 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     depths = np.empty((total, 1), np.float32)
     boxes = np.empty((total, 4), np.int32)
     counts = np.zeros((elements, plan.edges.shape[1] - 1, views, tiles_x * tiles_y), np.int64)
-    part_entries = np.zeros(counts.shape[:2], np.int64)
-
-    def project(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
-        """Project one of ``plan.parts``.
-
-        Args:
-            b: batch element.
-            p: part of the element.
-            first: first Gaussian of the part.
-            last: the Gaussian after its last one.
-            seen_by: views of the element.
-        """
-        part_entries[b, p] = projection.project(
-            means, quaternions, scales, opacities, colors, first, last, plan.views[seen_by],
-            plan.shifts[seen_by], plan.near, plan.far, settings.low_pass, settings.extent, settings.alpha_min,
-            settings.antialiased, tiles_x, records, depths, boxes, counts[b, p],
-        )  # fmt: skip
-
-    pool.run([partial(project, *part) for part in parts], total)
+    pool.run([
+        partial(
+            projection.project, means, quaternions, scales, opacities, colors, first, last,
+            plan.views[seen_by], plan.shifts[seen_by], plan.near, plan.far, settings.low_pass,
+            settings.extent, settings.alpha_min, settings.antialiased, tiles_x, records, depths, boxes,
+            counts[b, p],
+        )
+        for b, p, first, last, seen_by in parts
+    ], total)  # fmt: skip
     tile_starts = np.concatenate(([0], counts.sum(1).reshape(-1).cumsum()))
-    slots = np.cumsum(part_entries).reshape(part_entries.shape) - part_entries
+    of_parts = counts.sum((2, 3))
+    slots = np.cumsum(of_parts).reshape(of_parts.shape) - of_parts
     size = int(tile_starts[-1])
     each = 4 * (layout.ENTRY + (layout.gradient_width(colors.shape[1]) if differentiable else 0))
     require(
@@ -243,23 +234,13 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     next_free = tile_starts[:-1].reshape(elements, 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
     entries = np.empty((size, layout.ENTRY), np.int32)
     entry_starts = np.empty(total, np.int32)
-
-    def list_part(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
-        """List the splats of one of ``plan.parts`` in their tiles.
-
-        Args:
-            b: batch element.
-            p: part of the element.
-            first: first Gaussian of the part.
-            last: the Gaussian after its last one.
-            seen_by: views of the element.
-        """
-        scatter(
-            first, last, plan.shifts[seen_by], depths, boxes, tiles_x, slots[b, p], entry_starts,
+    pool.run([
+        partial(
+            scatter, first, last, plan.shifts[seen_by], depths, boxes, tiles_x, slots[b, p], entry_starts,
             next_free[b, p], entries,
-        )  # fmt: skip
-
-    pool.run([partial(list_part, *part) for part in parts], size)
+        )
+        for b, p, first, last, seen_by in parts
+    ], size)  # fmt: skip
     drawn = np.zeros(len(tile_starts) - 1, np.int64)
     reached = np.zeros(size, np.uint8)
     return _Splats(records, boxes, entry_starts, tile_starts, entries, drawn, reached)

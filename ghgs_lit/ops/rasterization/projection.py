@@ -134,11 +134,7 @@ def project(
         depths: gets z in metres, [splats, 1].
         boxes: gets the tiles that each splat touches, int32 [splats, 4].
         tile_counts: the part's entries in each tile, int64 [T, tiles]; grow.
-
-    Returns:
-        The number of entries.
     """
-    entries = 0
     for n in range(first, last, _WIDE):
         mean = tables.columns3(means, n, last)
         quaternion = tables.columns4(quaternions, n, last)
@@ -161,5 +157,3 @@ def project(
                 for tile_y in range(boxes[s, layout.Y0], boxes[s, layout.Y1]):
                     for tile_x in range(boxes[s, layout.X0], boxes[s, layout.X1]):
                         tile_counts[t, tile_y * tiles_x + tile_x] += 1
-                        entries += 1
-    return entries
