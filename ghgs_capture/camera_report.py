@@ -31,7 +31,7 @@ _MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point i
 # Usual factors of a resize after the calibration.
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 PERSON = (0.5, 2.5)  #: A person's largest extent in metres
-_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "kilometres": 1000.0}
+_UNITS = {"metres": 1.0, "millimetres": 0.001, "centimetres": 0.01, "kilometres": 1000.0}
 # A part of a mask is another person where it has this share of the largest part's area, or more.
 _PART = 1 / 3
 # Two copies of a photograph, stored with losses: least common share of their masks, and mean
@@ -229,12 +229,9 @@ def _describe_size(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
     silhouettes = _make_silhouettes(hypothesis.photographs(folder))
     focus, _ = subject_sphere(silhouettes)
     size = float(np.median([silhouette.extent(focus).max() for silhouette in silhouettes]))
-    if PERSON[0] <= size <= PERSON[1]:
-        return f"the subject is {size:.3g} units tall: a person in metres"
     for name, metres in _UNITS.items():
         if PERSON[0] <= size * metres <= PERSON[1]:
-            option = f"calibration.unit={metres:g}"
-            return f"the subject is {size:.4g} units tall, a person in {name}: {option} makes it metres"
+            return f"the subject is {size:.4g} units tall: a person in {name} (calibration.unit={metres:g})"
     return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
 
 
