@@ -18,7 +18,8 @@ Finding = tuple[str, str, Tensor]
 
 
 def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Finding]:
-    """What is expected of a batch's values, and where they violate it, without waiting for a GPU.
+    """Expectations of a batch's values, and where they are violated, without a device-to-host
+    synchronisation.
 
     Args:
         batch: its targets are not checked.
@@ -44,7 +45,7 @@ def refuse(findings: Sequence[Finding]) -> None:
     """Refuse a batch for the first field that violates what is expected of it, if any does.
 
     Args:
-        findings: of the batch; a GPU is waited for.
+        findings: of the batch, which are read with a device-to-host synchronisation.
 
     Raises:
         InputError: names the field, what was expected of it, and where it is violated.

@@ -232,7 +232,7 @@ class Loss(Protocol):
         Args:
             prediction: of the model.
             rendering: of its Gaussians from the targets' cameras.
-            batch: photographs, targets and what the data knows of bodies and depths.
+            batch: photographs, targets and bodies and depths where the data has them.
 
         Returns:
             The value, a scalar, and each term.

@@ -1,4 +1,4 @@
-"""Recorded calls: what is played back, what is refused, and what makes a class of its own."""
+"""Captured calls: what is replayed, what is rejected, and what makes another shape bucket."""
 
 import copy
 import dataclasses
@@ -47,7 +47,7 @@ def work(values):
 
 
 def test_other_values_give_what_an_eager_call_gives():
-    """From the third call on nothing but the recording runs, and results keep their memory."""
+    """From the third call on nothing but the graph runs, and results keep their memory."""
     cache, calls = made(), []
 
     def counted(values):
@@ -61,12 +61,12 @@ def test_other_values_give_what_an_eager_call_gives():
         assert torch.equal(result["order"][0], wanted["order"][0])
         assert result["order"][1:] == (3, "name")
         assert result["best"] is result["same"]
-    assert len(calls) == 3  # as always, once before the recording, and for it
+    assert len(calls) == 3  # eagerly, once before the capture, and for it
     assert cache.counts == {"eager": 1, "captured": 1, "replayed": 4}
 
 
 def test_dataclasses_come_back_with_what_they_keep():
-    """Values beside fields are inputs like fields: recorded functions may rely on them."""
+    """Values beside fields are inputs like fields: captured functions may depend on them."""
     cache = made()
 
     def moved(cameras):
@@ -82,7 +82,7 @@ def test_dataclasses_come_back_with_what_they_keep():
     assert cache.counts["replayed"] == 2
 
 
-def test_what_a_call_keeps_is_computed_by_the_recording():
+def test_what_a_call_keeps_is_computed_by_the_graph():
     """The call before it has computed it, too, of inputs that are not those to come."""
     cache = made()
 
@@ -105,8 +105,8 @@ def bfloat16():
     return torch.autocast("cpu", torch.bfloat16)
 
 
-def other_class(name):
-    """Inputs, key and surroundings that differ from the usual ones in one respect."""
+def other_bucket(name):
+    """Inputs, key and state of PyTorch that differ from the usual ones in one respect."""
     usual = {"inputs": (numbers(0), numbers(1), 7), "key": ("skip", 1), "around": nullcontext()}
     changes = {
         "shape": {"inputs": (numbers(0, 2, 4), numbers(1, 2, 4), 7)},
@@ -127,21 +127,21 @@ NAMES = ["shape", "dtype", "number", "type", "structure", "key", "autocast", "gr
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_difference_is_a_class_of_its_own(name):
-    """What a recording fixes must be the same."""
+def test_each_difference_is_another_bucket(name):
+    """What a graph fixes must be the same."""
     cache = made()
     for each in ("usual", "usual", name, "usual"):
-        case = other_class(each)
+        case = other_bucket(each)
         with case["around"]:
             cache(lambda values: values[0] + values[1], case["inputs"], case["key"])
     assert cache.counts == {"eager": 2, "captured": 1, "replayed": 1}
 
 
-def test_rounding_of_products_is_a_class_of_its_own():
+def test_rounding_of_products_is_another_bucket():
     """TF32 chooses other kernels."""
     kinds = []
     for name in ("usual", "rounding"):
-        with other_class(name)["around"]:
+        with other_bucket(name)["around"]:
             kinds.append(graphs._surroundings("cuda"))
     assert kinds[0] != kinds[1]
 
@@ -181,8 +181,8 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("function", REFUSED)
-def test_what_cannot_be_played_back_stays_eager(function):
-    """It is said once, with the reason, and the answer is right."""
+def test_what_cannot_be_replayed_stays_eager(function):
+    """A warning names the reason once, and results are right."""
     cache = made()
     cache(function, (numbers(0), numbers(1)))
     with pytest.warns(UserWarning, match=REFUSED[function]):
@@ -199,7 +199,7 @@ def test_what_cannot_be_played_back_stays_eager(function):
 
 
 def refusal(function, values):
-    """Why a function is not recorded on the pretend device."""
+    """Why a function is not captured on the pretend device."""
     cache = GraphCache(backend=OperatorBackend(), eager=0)
     with pytest.warns(UserWarning, match="not captured"):
         cache(function, values)
@@ -207,7 +207,7 @@ def refusal(function, values):
 
 
 def test_copies_from_the_host_are_refused():
-    """A recording would read memory that holds something else by then;
+    """A replay would read memory that holds something else by then;
     a waiting copy fails on CUDA."""
     cache = GraphCache(backend=OperatorBackend())
     with pretend_device():
@@ -222,8 +222,8 @@ def test_copies_from_the_host_are_refused():
     assert cache.counts["replayed"] == 1
 
 
-def test_tensors_of_other_devices_are_not_recorded():
-    """Recordings act on one type of device; all else is eager, and nothing is said."""
+def test_tensors_of_other_devices_are_not_captured():
+    """Graphs are of one type of device; all else is eager, without a warning."""
     cache = GraphCache(backend=OperatorBackend())
     for _ in range(3):
         cache(work, (numbers(0), numbers(1)))
@@ -231,15 +231,15 @@ def test_tensors_of_other_devices_are_not_recorded():
 
 
 def test_an_unhashable_value_is_eager():
-    """It cannot be compared with what was recorded."""
+    """It cannot be compared with what was captured."""
     cache = made()
     for _ in range(3):
         cache(lambda values: values[0] + 1, (numbers(0), {"a": {1}}))
     assert cache.counts == {"eager": 3}
 
 
-def test_the_least_recently_used_recording_makes_room():
-    """And is recorded again when it comes back."""
+def test_the_least_recently_used_graph_makes_room():
+    """And is captured again when its bucket returns."""
     cache = made(limit=2)
     for size in (1, 1, 2, 2, 1, 3, 3):  # 2 leaves
         cache(lambda x: x + 1, numbers(0, size))
@@ -251,7 +251,7 @@ def test_the_least_recently_used_recording_makes_room():
 
 
 def test_memory_of_caches_is_kept():
-    """A cache may forget a table that a recording reads."""
+    """A cache may drop a table that a graph reads."""
     cache = made()
     address = table(3).data_ptr()
     for seed in range(3):
@@ -264,8 +264,8 @@ def test_memory_of_caches_is_kept():
     assert address in kept or table(3).data_ptr() in kept
 
 
-def test_weights_that_change_in_place_are_seen():
-    """Training writes them where they are; after they have moved, all is recorded again."""
+def test_weights_that_change_in_place_are_read():
+    """Training writes them where they are; after they have moved, all is captured again."""
     cache, layer = made(), nn.Linear(3, 2)
     for seed in range(3):
         cache(layer, numbers(seed))
@@ -278,8 +278,8 @@ def test_weights_that_change_in_place_are_seen():
     assert cache.counts == {"eager": 2, "captured": 2, "replayed": 3}
 
 
-def test_casts_of_weights_are_recorded_with_what_reads_them():
-    """Autocast shares casts within a context; a recording reads the weights again."""
+def test_casts_of_weights_are_captured_with_what_reads_them():
+    """Autocast shares casts within a context; a replay casts the weights again."""
     cache, layer = made(), nn.Linear(3, 2)
     with bfloat16():
         for seed in range(3):
@@ -289,7 +289,7 @@ def test_casts_of_weights_are_recorded_with_what_reads_them():
         assert torch.equal(cache(layer, numbers(5)), layer(numbers(5)))
 
 
-def test_where_memory_is_lacking_recordings_make_room():
+def test_where_memory_is_lacking_graphs_make_room():
     """Those of all caches; without any, or where a call has written, the error stands."""
     holder, other = made(), made()
     for seed in range(2):
@@ -344,8 +344,8 @@ class Held:
     """Memory of a call that fails."""
 
 
-def test_what_comes_again_too_late_is_not_recorded():
-    """Recordings would push each other out before they are played back."""
+def test_what_returns_too_late_is_not_captured():
+    """Graphs would replace each other before they are replayed."""
     cache = GraphCache(limit=2, backend=OperatorBackend("cpu"), recent=2)
     for _ in range(3):
         for size in (1, 2, 3):

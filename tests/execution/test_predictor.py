@@ -61,7 +61,7 @@ def differs(found, wanted):
 
 
 @pytest.mark.parametrize("kind", [("model=paper", "skip=fast"), ("model=recurrent",)], ids=str)
-def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
+def test_other_scenes_of_a_bucket_are_predicted_as_eagerly(kind):
     """Other masks and colours; as many Gaussians as each has pixels."""
     model = capturing(*kind)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (3, 1.0)):
@@ -74,7 +74,7 @@ def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
 
 
 def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
-    """Both the copies and full size, which starts from their depths and tokens, are played back."""
+    """Both the copies and full size, which starts from their depths and tokens, are replayed."""
     model = capturing("model=recurrent", "rounds.height=14")
     for color in (1.0, 0.9, 0.8, 0.7):
         batch = scene(0.3, color)
@@ -85,7 +85,7 @@ def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
     assert counts(model) == {"eager": 3, "captured": 3, "replayed": 6}
 
 
-def test_what_changes_a_prediction_is_another_class():
+def test_what_changes_a_prediction_is_another_bucket():
     """Sizes, the number of rounds, what the encoder sees."""
     model = capturing("model=recurrent", "encoder.semantic=null")
     for _ in range(2):
@@ -99,7 +99,7 @@ def test_what_changes_a_prediction_is_another_class():
 
 
 def test_what_is_watched_or_has_a_gradient_is_called():
-    """Watchers are told of every stage, and a recording has no gradient."""
+    """Watchers observe every stage, and a graph has no gradient."""
     model = capturing("model=paper")
     for _ in range(2):
         model(scene())
@@ -111,11 +111,11 @@ def test_what_is_watched_or_has_a_gradient_is_called():
     eager(model, scene())
     model.model.train()
     model(scene())
-    # What precedes the plan is played back with a gradient, and of another class in training.
+    # What precedes the plan is replayed with a gradient, and of another bucket in training.
     assert counts(model) == before | {"replayed": 1, "eager": 3}
 
 
-def test_too_little_room_is_answered_by_another_capturing(monkeypatch):
+def test_too_little_room_is_followed_by_another_capture(monkeypatch):
     """The first, which would have as little room again, is forgotten."""
     model, batch = capturing("model=recurrent"), scene()
     for _ in range(3):
@@ -215,18 +215,18 @@ def test_a_copy_captures_anew():
     assert len(predictor.graphs._graphs) == 2
 
 
-def test_what_is_played_back_is_not_asked_for(there):
+def test_a_replay_launches_few_kernels(there):
     """The encoder, the plan and what surrounds the stages remain, and as many waits as before."""
-    model, batch, asked = capturing("model=recurrent"), scene(), []
+    model, batch, counted = capturing("model=recurrent"), scene(), []
     model.graphs.backend = SilentBackend()
     for _ in range(3):
         there.clear()
         model(batch)
-        asked.append((there.launches, there.waits.total()))
-    (eager, waits), _, (played, as_many) = asked
-    print(eager, played, waits, as_many)
-    assert 80 * played < eager
-    assert as_many <= waits
+        counted.append((there.launches, there.waits.total()))
+    (eager, waits), _, (replayed, waits_of_replay) = counted
+    print(eager, replayed, waits, waits_of_replay)
+    assert 80 * replayed < eager
+    assert waits_of_replay <= waits
 
 
 def test_what_precedes_the_plan_keeps_names_and_gradients():

@@ -139,7 +139,7 @@ def test_gradients_of_float16_do_not_underflow():
 
 
 def test_weights_that_move_are_read_where_they_are():
-    """An optimizer moves them in place; the next step that is played back sees it."""
+    """An optimizer moves them in place; the next replay reads them."""
     model, batch = training("model=paper"), scene()
     captured = capturing(model)
     optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
@@ -173,52 +173,52 @@ def trained(folder, capture):
 
 def test_a_training_comes_to_the_same_weights(tmp_path):
     """With Lightning's loop, parts of a step that are summed up, and clipping."""
-    (wanted, none), (found, played_back) = (trained(tmp_path, capture) for capture in ("off", "auto"))
-    assert (none, played_back) == (0, 6)
+    (wanted, none), (found, replayed) = (trained(tmp_path, capture) for capture in ("off", "auto"))
+    assert (none, replayed) == (0, 6)
     for name in wanted:
         torch.testing.assert_close(found[name], wanted[name], rtol=1e-4, atol=1e-5, msg=name)
 
 
-class Asked(L.Callback):
-    """Launches and waits of each step of a training, the optimizer, the average and logging included."""
+class LaunchCounter(L.Callback):
+    """Launches and synchronisations of each step of a training, with optimizer, average and logging."""
 
     def __init__(self, log):
-        self.asked, self.found = log, []
+        self.launch_log, self.counts = log, []
 
     def on_train_batch_start(self, *_):
-        self.asked.clear()
+        self.launch_log.clear()
 
     def on_train_batch_end(self, *_):
-        self.found.append((self.asked.launches, self.asked.waits.total()))
+        self.counts.append((self.launch_log.launches, self.launch_log.waits.total()))
 
 
-def test_a_step_of_a_training_asks_for_little(there, tmp_path, monkeypatch):
-    """In Lightning's loop: waits for the plan, for the room of renderings, and for the guard."""
-    model, asked = training("model=hull"), Asked(there)
+def test_a_step_of_a_training_launches_few_kernels(there, tmp_path, monkeypatch):
+    """In Lightning's loop: synchronisations for the plan, for the room of renderings, and for the guard."""
+    model, counter = training("model=hull"), LaunchCounter(there)
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, matrix_scale=1.0))
     with_backend(module.captured_step, SilentBackend)
     configured = module.configure_optimizers
 
-    def recording_too():
-        answer = configured()
-        answer["optimizer"].graphs = GraphCache(backend=SilentBackend())
-        return answer
+    def configure_with_graphs():
+        configuration = configured()
+        configuration["optimizer"].graphs = GraphCache(backend=SilentBackend())
+        return configuration
 
-    monkeypatch.setattr(module, "configure_optimizers", recording_too)
+    monkeypatch.setattr(module, "configure_optimizers", configure_with_graphs)
     batches = [scene(color=1 - number / 20).to("cpu") for number in range(5)]
     trainer = L.Trainer(
         strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()), max_steps=5,
-        callbacks=[Averaging(0.999), asked], limit_val_batches=0, default_root_dir=tmp_path, logger=False,
+        callbacks=[Averaging(0.999), counter], limit_val_batches=0, default_root_dir=tmp_path, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
     trainer.fit(module, DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
-    launches, waits = asked.found[-1]
+    launches, waits = counter.counts[-1]
     print(launches, waits)
     assert waits <= 3
-    assert launches <= 80 < asked.found[0][0]
+    assert launches <= 80 < counter.counts[0][0]
 
 
-def test_rounds_are_drawn_once_and_are_a_bucket_each():
+def test_numbers_of_rounds_are_sampled_once_and_are_a_bucket_each():
     model, batch = training("model=recurrent"), scene()
     captured = capturing(model)
     for count in (1, 1, 2, 1):
@@ -227,7 +227,7 @@ def test_rounds_are_drawn_once_and_are_a_bucket_each():
     assert dict(captured.graphs.counts) == {"eager": 2, "captured": 1, "replayed": 1}
 
 
-def test_too_little_room_is_answered_by_another_training(monkeypatch):
+def test_too_little_room_is_followed_by_another_capture(monkeypatch):
     captured, batch = capturing(training("model=paper")), scene()
     for _ in range(3):
         captured(batch)
@@ -253,7 +253,7 @@ def test_a_batch_that_does_not_fit_is_called_and_prepared_once(monkeypatch):
 
 
 def test_sizes_are_kept_while_they_are_enough():
-    """Smaller subjects are played back; one that is larger leaves room for others;
+    """Smaller subjects are replayed; a larger one leaves room for others;
     nothing else changes."""
     model = training("model=hull", "skip=fast")
     captured = capturing(model)

@@ -79,7 +79,7 @@ def hull_bounds(
         samples: depths that are tried along each ray.
         rays: indices of the masks' pixels, if known.
         voting: views that may say "outside"; None: those whose mask is not empty.
-        count: the masks have no more pixels than this, so that a GPU need not be asked;
+        count: the masks have no more pixels than this, which avoids a device-to-host synchronisation;
             None: unknown.
         cut: sides of the frame that cut the subject; None: those that the masks touch.
 

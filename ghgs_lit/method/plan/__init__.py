@@ -2,10 +2,9 @@
 
 A person covers a tenth to a fifth of the frame. Which patches become tokens, which tokens are
 recalibrated, which pixels become Gaussians, and the windows of the maps that dense heads compute,
-follow from the masks and from the preset of ``skip`` in force. :func:`make_plan` reads all of it at
-once, so that the host waits for a GPU a single time, and gives a :class:`Plan`: indices and
-counts. Stages are functions of tensors of known size: they take the plan, and decide nothing of
-the kind themselves.
+follow from the masks and from the preset of ``skip`` in force. :func:`make_plan` reads all of it
+with one device-to-host synchronisation and returns a :class:`Plan`: indices and counts. Stages are
+functions of tensors of known size: they take the plan and decide nothing of the kind.
 
 * :mod:`ghgs_lit.method.plan.presets`: the presets. A new one is a file in ``conf/skip``.
 * :mod:`ghgs_lit.method.plan.plan`: the plan, and the one place where masks are read.

@@ -26,7 +26,7 @@ class KeptPatches:
         size: number of rows of each image, at least that of its kept patches: others repeat its
             last one (the first of all patches where none is kept); None: those that are kept.
 
-    Places are found when they are first asked for."""
+    Places are computed on first use."""
 
     def __init__(
         self,

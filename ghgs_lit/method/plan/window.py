@@ -186,8 +186,8 @@ def _of_whole_maps(
 
     Returns:
         For each of the target's cells the first of the two cells around it, as a number that is
-        known without waiting for a GPU; its place; the first and the second cell; and the weight
-        of the second.
+        known without a device-to-host synchronisation; its place; the first and the second cell; and
+        the weight of the second.
     """
     # A division and a product, both rounded to the precision of the maps, as in PyTorch.
     step = torch.tensor((source - 1) / max(target - 1, 1), dtype=dtype, device="cpu").item()

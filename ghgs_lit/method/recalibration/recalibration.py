@@ -74,7 +74,7 @@ class Neighborhood(NamedTuple):
         near: their neighbours, as indices among them.
         cosines: of their semantic features and the neighbours'; None: similarity is ignored (s = 1).
         left_out: -inf where a neighbour does not count, else 0; None: all count.
-        places: of the tokens, in units of the subject; None: values know none.
+        places: of the tokens, in units of the subject; None: values do not depend on places.
     """
 
     near: Int[Tensor, "n k"]
@@ -93,7 +93,7 @@ class SemanticAttention(nn.Module):
             ``product`` multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors'
             release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar
             neighbours instead of pulling their logit to 0, ``none`` ignores it (s = 1).
-        has_places: whether the value of a neighbour also says where it lies from the query,
+        has_places: whether the value of a neighbour also depends on where it lies from the query,
             by a linear map of the difference of their places that starts at 0 (not the
             paper's). By linearity that is the map of a head's mean place minus the query's:
             no tensor of all pairs.

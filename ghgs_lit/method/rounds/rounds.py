@@ -138,7 +138,7 @@ class NoRounds(nn.Module):
         return (state.activated(activate, batch),)
 
     def drawn(self, count: int | None = None) -> AbstractContextManager[None]:
-        """Nothing is drawn."""
+        """No number of rounds is sampled."""
         return nullcontext()
 
 
@@ -180,7 +180,7 @@ class Rounds(nn.Module):
     @property
     def height(self) -> int | None:
         """Pixels of the subject's height that the weights know;
-        None: any, or no training said it."""
+        None: any, or it is not known from the training."""
         known = self.options.height
         return None if known == "auto" else known
 
