@@ -233,7 +233,7 @@ def _condition(stage: Stage, exact: Values, truth: Values) -> Values:
         moved = dict(exact)
         for name, value in exact.items():
             if value.is_floating_point() and name not in stage.steady:
-                signs = 1 - 2 * torch.randint(2, value.shape, generator=g)
+                signs = 1 - 2 * torch.randint(2, value.shape[1:], generator=g)
                 moved[name] = value * (1 + size * _STEP * signs)
         for name, value in evaluate(stage, moved, "float64").items():
             spread[name] = torch.maximum(spread[name], _largest(value - truth[name]) / abs(size * _STEP))
