@@ -231,7 +231,8 @@ def _describe_size(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
     size = float(np.median([silhouette.extent(focus).max() for silhouette in silhouettes]))
     for name, metres in _UNITS.items():
         if PERSON[0] <= size * metres <= PERSON[1]:
-            return f"the subject is {size:.4g} units tall: a person in {name} (calibration.unit={metres:g})"
+            option = f"calibration.unit={metres:g}"
+            return f"the subject is {float(f'{size:.3g}'):g} units tall: a person in {name} ({option})"
     return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
 
 
