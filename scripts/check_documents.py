@@ -75,6 +75,7 @@ NOT_RUN = [
     (r"ghgs (train|table) .*runs/peers|ghgs evaluate .*train: 48", "needs 60 people, or runs of theirs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
     (r"python scripts/mutate\.py", "runs the whole suite"),
+    (r"python -m pytest -m gpu|python benchmarks/gpu\.py (?!.*--dry)", "needs a GPU and a checkout"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python scripts/drill\.py", "trains twelve runs, killed ten times"),
@@ -98,6 +99,8 @@ SMALL = [
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"refine=15", "refine=2", "two steps"),
     (r"^(ghgs predict .*)", r"\1 turntable.frames=2", "two pictures"),
+    (r"images=videos (.*)masks=mask_videos", r"images=instants \1masks=instant_masks", "two instants"),
+    (r"minutes=3", "minutes=1", "a minute"),
     (r"^(ghgs predict data=.*)", r"\1 data.size=112", "112 x 112 pixels"),
     (r"(?<==)/data/", "", "folders next to this one"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
@@ -181,6 +184,9 @@ for name in names:
     cameras[name] = {kind + "s": np.load(root / "parm" / name / f"0_{kind}.npy").tolist()
                      for kind in ("intrinsic", "extrinsic")}
 Path("cameras.json").write_text(json.dumps({"cameras": cameras}))
+for instant in "12":
+    shutil.copytree("photographs", f"instants/{instant}")
+    shutil.copytree("masks", f"instant_masks/{instant}")
 END"""
 # A document, and the commands that make what its reader has.
 BEFORE = {

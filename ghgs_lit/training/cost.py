@@ -89,18 +89,20 @@ class Costs(Callback):
         self._stack.close()
 
 
-class TrainingCost(Timer):
+class TrainingCost(Callback):
     """Seconds and peak memory of the training of the weights. Checkpoints contain both, so that a
     resumed run continues to count; work after the last checkpoint of a killed process is repeated
-    and counts once. Validation and writing of checkpoints count."""
+    and counts once. Validation and writing of checkpoints count.
+
+    It has a timer and is none: Lightning ignores ``max_time`` next to a callback that is a Timer."""
 
     def __init__(self) -> None:
-        super().__init__()
+        self._timer = Timer()
         self._peak = 0  # of earlier sessions, or of all once training has ended
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start the clock."""
-        super().on_train_start(trainer, pl_module)
+        self._timer.on_train_start(trainer, pl_module)
         self._device = pl_module.device
         if self._device.type != "cuda":
             forget_peak()  # runs of a sweep share a process
@@ -108,18 +110,18 @@ class TrainingCost(Timer):
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop the clock."""
         self._peak = self.peak_bytes
-        super().on_train_end(trainer, pl_module)
+        self._timer.on_train_end(trainer, pl_module)
 
     @property
     def seconds(self) -> float:
         """Seconds of all sessions so far."""
-        return self.time_elapsed()
+        return self._timer.time_elapsed()
 
     @property
     def peak_bytes(self) -> int:
         """Peak memory of the first process over all sessions: of tensors on a GPU,
         else of the process."""
-        if self.start_time() is None or self.end_time() is not None:
+        if self._timer.start_time() is None or self._timer.end_time() is not None:
             return self._peak
         on_gpu = self._device.type == "cuda"
         now = torch.cuda.max_memory_allocated(self._device) if on_gpu else resident_bytes("VmHWM")
@@ -127,9 +129,9 @@ class TrainingCost(Timer):
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds and peak so far, for the checkpoint."""
-        return super().state_dict() | {"peak_bytes": self.peak_bytes}
+        return self._timer.state_dict() | {"peak_bytes": self.peak_bytes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from the numbers of a checkpoint."""
-        super().load_state_dict(state_dict)
+        self._timer.load_state_dict(state_dict)
         self._peak = state_dict["peak_bytes"]

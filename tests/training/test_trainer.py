@@ -70,6 +70,12 @@ def test_validations_are_counted_in_steps_of_the_optimizer(tmp_path, accumulated
     assert fit(tmp_path, **options)[1].steps == [2, 4, 6]
 
 
+def test_a_training_ends_when_its_time_is_up(tmp_path):
+    """Lightning ignores ``max_time`` next to a callback that is a Timer."""
+    trainer, _ = fit(tmp_path, max_steps=-1, max_time={"seconds": 1}, limit_val_batches=0)
+    assert trainer.global_step > 0
+
+
 @pytest.mark.parametrize("batches", [2, 0.5])
 def test_the_same_batches_again_and_again(tmp_path, batches):
     """A model that cannot overfit two batches is wrong."""
