@@ -112,7 +112,7 @@ SMALL = [
     (r"<run>", "runs/before", "a small run"),
     (r"<checkpoint>", "shipped", "the weights that come with the package"),
     (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
-    (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
+    (r"(?<=data\.root=)\.\.\.", "zju", "a miniature"),
     (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "next to the miniature"),
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1 data.render_workers=0",
