@@ -1,4 +1,4 @@
-"""Extents of masks, and places of their pixels."""
+"""Extents of masks, and indices of their pixels."""
 
 from typing import NamedTuple
 
@@ -45,7 +45,7 @@ class Extent(NamedTuple):
 
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
-    """Extent of each mask; the host waits for a GPU once.
+    """Extent of each mask, with one device-to-host synchronisation.
 
     Args:
         masks: [n, H, W].
@@ -57,7 +57,7 @@ def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
 
 
 def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
-    """The numbers of each mask's :class:`Extent`, where the masks are, without a wait.
+    """The numbers of each mask's :class:`Extent`, on the masks' device, without a synchronisation.
 
     Args:
         masks: [n, H, W].
@@ -72,7 +72,7 @@ def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
 
 
 def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:
-    """Flat indices of the True values, as ``nonzero`` but without waiting for a GPU.
+    """Flat indices of the True values, as ``nonzero`` but without a device-to-host synchronisation.
 
     Args:
         mask: bools of any shape.

@@ -95,13 +95,13 @@ class Cameras(TensorStruct):
 
     @cached_property
     def has_skew(self) -> bool:
-        """Whether any ``K[0, 1]`` is not 0; the host waits for a GPU at the first use,
-        if none read it."""
+        """Whether any ``K[0, 1]`` is not 0; a device-to-host synchronisation at
+        the first use, unless :meth:`note_skew` was called."""
         return bool(self.any_skew)
 
     @property
     def any_skew(self) -> Bool[Tensor, ""]:
-        """:attr:`has_skew` where the cameras are, without a wait."""
+        """:attr:`has_skew` as a tensor on the cameras' device, without a synchronisation."""
         return (self.intrinsics[..., 0, 1] != 0).any()
 
     def note_skew(self, has_skew: bool) -> None:
@@ -138,7 +138,7 @@ class Cameras(TensorStruct):
 
 @dataclass(frozen=True)
 class Targets(TensorStruct):
-    """Photographs to predict, from cameras other than the input cameras. ``names``: the photographs
+    """Target images, from cameras other than the input cameras. ``names``: of the images
     of each subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for
     all subjects. ``depths``: true z-depths in metres, 0 where unknown; None: unknown."""
 
@@ -162,12 +162,12 @@ class Targets(TensorStruct):
 
 @dataclass(frozen=True)
 class Batch(TensorStruct):
-    """Input photographs of ``B`` subjects, with everything that is known about them.
+    """Input views of ``B`` subjects, with masks, cameras and optional annotations.
 
     ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in
     metres, 0 where unknown. ``alpha``: soft mattes, the share of each pixel that shows the
     subject, by which its colour is multiplied. ``log_gains``: logarithms of the cameras' gains,
-    by which photographs are already divided. ``views``: names of the photographs of each subject.
+    by which images are already divided. ``views``: names of the input views of each subject.
     None: unknown."""
 
     images: Float[Tensor, "B V 3 H W"]
@@ -182,7 +182,7 @@ class Batch(TensorStruct):
     views: tuple[tuple[str, ...], ...] = ()
 
     def of_views(self, views: Sequence[int]) -> "Batch":
-        """The batch with only the photographs of these numbers, in their order,
+        """The batch with only the input views of these indices, in their order,
         and the same targets."""
         views = list(views)
         names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
@@ -193,7 +193,7 @@ class Batch(TensorStruct):
         return dataclasses.replace(self, **parts, views=tuple(kept))
 
     def recolored(self, **changes: Tensor) -> "Batch":
-        """The batch with other colours and the same masks, whose extents stay known."""
+        """The batch with other colours and the same masks, whose extents stay cached."""
         changed = dataclasses.replace(self, **changes)
         names = ("extents", "pixels", "_pixels")
         changed.__dict__.update({name: vars(self)[name] for name in names if name in vars(self)})
@@ -214,7 +214,7 @@ class Batch(TensorStruct):
 
         Args:
             extents: :attr:`extents`.
-            pixels: gives :attr:`pixels` in ascending order, when they are first asked for.
+            pixels: returns :attr:`pixels` in ascending order; called at their first use.
             has_skew: :attr:`Cameras.has_skew` of the input cameras.
         """
         self.__dict__.update(extents=list(extents), _pixels=pixels)
@@ -223,7 +223,7 @@ class Batch(TensorStruct):
     @cached_property
     def extents(self) -> list[Extent]:
         """Extent of the subject in each image ``b * V + v``;
-        the host may wait for a GPU at the first use."""
+        may cause a device-to-host synchronisation at the first use."""
         return extents(self.masks.flatten(0, 1))
 
     @cached_property
@@ -248,8 +248,8 @@ class Tokens(TensorStruct):
     ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image,
     row, column. ``grid`` is ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out
     layers. ``semantic``: features F, detached: they weight the attention, which does not train
-    them. ``real``: which rows are tokens, where each image has the same number of rows, a size
-    class; None: all."""
+    them. ``real``: which rows are tokens, where each image has the same number of rows, a shape
+    bucket; None: all."""
 
     latent: tuple[Float[Tensor, "N C"], ...]
     semantic: Float[Tensor, "N S"]
@@ -273,7 +273,7 @@ class Tokens(TensorStruct):
 
     def of_images(self, images: slice) -> "Tokens":
         """The tokens of consecutive images ``b * V + v``, as one element;
-        the host may wait for a GPU."""
+        may cause a device-to-host synchronisation."""
         b, v, h, w = self.grid
         if images == slice(0, b * v):
             part = self
@@ -358,7 +358,7 @@ class Gaussians(TensorStruct):
 
     @property
     def is_finite(self) -> Bool[Tensor, " N"]:
-        """Which Gaussians have finite numbers only; no renderer draws the others."""
+        """Which Gaussians have finite numbers only; renderers skip the others."""
         fields = (self.means, self.quaternions, self.scales, self.opacities[:, None], self.colors)
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 

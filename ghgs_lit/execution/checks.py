@@ -42,13 +42,13 @@ def any_bad(findings: Sequence[Finding]) -> Bool[Tensor, ""]:
 
 
 def refuse(findings: Sequence[Finding]) -> None:
-    """Refuse a batch for the first field that violates what is expected of it, if any does.
+    """Rejects a batch at the first field whose values violate an expectation.
 
     Args:
         findings: of the batch, which are read with a device-to-host synchronisation.
 
     Raises:
-        InputError: names the field, what was expected of it, and where it is violated.
+        InputError: with the field, the expectation, and the violating elements or views.
     """
     for name, expected, bad in findings:
         found = f"others at {bad.nonzero().tolist()} (element, view)"
@@ -56,7 +56,7 @@ def refuse(findings: Sequence[Finding]) -> None:
 
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
-    """InputError: a shape or a dtype of the batch is not what the stages work on."""
+    """Raises InputError for a shape or a dtype that the stages do not support."""
     images = batch.images
     colored = images.dim() == 5 and images.shape[2] == 3
     require(colored, "batch.images", "[B, V, 3, H, W]", tuple(images.shape))
@@ -98,7 +98,7 @@ def _findings_of_cameras(batch: Batch) -> list[Finding]:
 
 
 def _findings_of_values(batch: Batch) -> list[Finding]:
-    """Checks of every value of photographs, mattes, depths and bodies."""
+    """Checks of every value of images, mattes, depths and bodies."""
     within = "finite values within [0, 1]"
     findings = [("images", within, _beyond(batch.images, 1.0))]
     if batch.alpha is not None:

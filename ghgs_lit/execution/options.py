@@ -1,4 +1,4 @@
-"""Options of what is done before and after the stages (``conf/model``)."""
+"""Options of pre- and postprocessing around the stages (``conf/model``)."""
 
 from typing import Literal
 
@@ -14,14 +14,14 @@ class ModelOptions(Options):
     name: Text = "paper"
     """Name of the combination of stages, for tables."""
     pad: Literal["none", "multiple"] = "none"
-    """multiple: photographs get a black border up to the next multiple of the patch size, which is
-    cut off again; none: their sides must be multiples."""
+    """multiple: pad images with black up to the next multiple of the patch size, and crop
+    predictions again; none: their sides must be multiples."""
     frame: Literal["subject", "world"] = "subject"
     """subject: the stages work in metres around the subject, whatever the world's unit, origin and
     axes; world: in coordinates as they are given."""
     matte: float | None = Field(None, ge=0, le=0.5)
-    """Pixels that show a larger share of the subject become Gaussians, whose colours and opacities
-    know that share; null: masks decide, mattes are ignored."""
+    """Pixels that show a larger share of the subject become Gaussians, and the share is part of
+    their colours and opacities; null: masks decide, mattes are ignored."""
     capture: Literal["auto", "off"] = "auto"
     """auto: on CUDA, predictions and training steps of one shape bucket are captured as a CUDA graph
     and replayed; off: every operator is called each time."""

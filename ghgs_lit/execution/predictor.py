@@ -27,12 +27,12 @@ from ghgs_lit.weights.reading import SHIPPED
 
 
 class Prepared(NamedTuple):
-    """A batch as the stages see it.
+    """A preprocessed batch and its plan.
 
     Attributes:
         batch: preprocessed.
         plan: of it.
-        done: what was done to it.
+        done: its preprocessing.
         state: of the model whose work is captured; None: operators are called one by one.
     """
 
@@ -48,7 +48,7 @@ class Predictor:
 
     Args:
         model: the stages.
-        options: what is done around them; None: those of the configuration that built the model.
+        options: of pre- and postprocessing; None: those of the configuration that built the model.
         precision: of products, one of :data:`ghgs_lit.geometry.precision.PRECISIONS`.
         checks_values: reject input views, depths and bodies with NaN or values out of range.
 
@@ -110,11 +110,11 @@ class Predictor:
         return self.finish(self.prepare(batch))
 
     def prepare(self, batch: Batch, least: Sizes | None = None) -> Prepared:
-        """What precedes the stages.
+        """Checks, preprocesses and plans a batch.
 
         Args:
-            batch: as of :meth:`__call__`.
-            least: sizes that the plan keeps as long as they are enough; None: those of the scene.
+            batch: as for :meth:`__call__`.
+            least: sizes that the plan reuses while they suffice; None: sizes of the scene.
 
         Raises:
             InputError: the batch does not fit the stages.
@@ -129,7 +129,7 @@ class Predictor:
         return Prepared(inside, plan, done, state)
 
     def finish(self, prepared: Prepared) -> Prediction:
-        """The prediction for what is prepared."""
+        """The prediction for a prepared batch."""
         with precision_of(self.precision, prepared.batch.masks.device):
             prediction = self._predict(prepared, self._coarse(prepared))
         return prepared.plan.trimmed(prediction)
@@ -166,7 +166,7 @@ class Predictor:
     def _captured(
         self, batch: Batch, state: ModelState
     ) -> tuple[Batch, Preprocessing, list[Finding], MaskStatistics]:
-        """:meth:`_enter`, captured where no gradient is wanted."""
+        """:meth:`_enter`, captured where no gradient is required."""
         tensors: list[torch.Tensor] = []
         described(batch, tensors)
         if any(tensor.requires_grad for tensor in tensors):
@@ -215,7 +215,7 @@ class Predictor:
         return False
 
     def _coarse(self, prepared: Prepared) -> Coarse | None:
-        """What is found in smaller copies of views with subjects taller than the rounds know."""
+        """Predictions from downsampled views of subjects taller than in training."""
         model = self.model
         if model.rounds.height is None:
             return None

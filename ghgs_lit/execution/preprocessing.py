@@ -1,5 +1,5 @@
-"""What surrounds the stages: masks follow mattes, the world becomes metres around the subject, input
-views get a black border up to whole patches; and the way back."""
+"""Preprocessing of a batch (masks from mattes, metres around the subject, a black border up to whole
+patches) and its inverse for predictions."""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,7 @@ from ghgs_lit.types import Batch, Prediction
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """What was done to a batch, so that it can be undone in its prediction.
+    """Preprocessing of a batch, recorded so that it can be inverted in its prediction.
 
     Attributes:
         dtype: of the cameras that were given.
@@ -38,16 +38,16 @@ class Preprocessing:
 def preprocess(
     batch: Batch, options: ModelOptions, patch_size: int, checks_values: bool
 ) -> tuple[Batch, Preprocessing, list[Finding]]:
-    """The batch as the stages see it.
+    """The preprocessed batch.
 
     Args:
         batch: in the cameras' world.
-        options: what is done.
+        options: of the preprocessing.
         patch_size: of the encoder, in pixels.
         checks_values: check every value, too.
 
     Returns:
-        The batch, what was done, and what is expected of its values, to be read later.
+        The batch, its preprocessing, and findings about its values, to be read later.
 
     Raises:
         InputError: a shape or a dtype is wrong.

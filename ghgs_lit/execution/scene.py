@@ -17,7 +17,7 @@ from ghgs_lit.types import Batch, DecodedPixels
 
 @dataclass(frozen=True)
 class Scene:
-    """What the stages read of a batch and its plan."""
+    """The parts of a batch and its plan that the stages read."""
 
     batch: Batch
     shown: Bool[Tensor, "B V h w"]

@@ -17,7 +17,7 @@ _HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_
 
 
 class ModelState(NamedTuple):
-    """What a model computes with.
+    """Weights and settings that a model's computation depends on.
 
     Attributes:
         weights: identity and address of all parameters and buffers.

@@ -75,7 +75,7 @@ class _Pass(nn.Module):
         """The loss and its terms. Gaussians that fill a bucket are rendered, too, with opacity 0.
 
         Args:
-            scene: the batch as the stages see it, and its plan.
+            scene: the preprocessed batch, and its plan.
             done: what was done to it.
             seen: the batch that was given, with targets.
         """
@@ -177,7 +177,7 @@ class CapturedStep:
         """The loss, whose gradients come from a graph.
 
         Args:
-            prepared: the batch as the stages see it.
+            prepared: the preprocessed batch.
             seen: the batch that was given, without names.
             scale: factor of the loss; None: 1.
         """

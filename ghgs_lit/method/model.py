@@ -25,9 +25,9 @@ from ghgs_lit.types import Batch, Prediction, Tokens
 
 
 class GHGS(nn.Module):
-    """The whole method: the stages of Figure 2 of the paper, and rounds.
+    """The whole method: the stages of Figure 2 of the paper, followed by optional refinement rounds.
 
-    :class:`ghgs_lit.execution.Predictor` gives it batches of any world and size.
+    :class:`ghgs_lit.execution.Predictor` preprocesses batches of any world frame and size for it.
 
     Args:
         bounds: near and far of each pixel's ray.
@@ -36,7 +36,7 @@ class GHGS(nn.Module):
         unprojection: depths to points in the world.
         recalibration: tokens to tokens, by attention among neighbouring points.
         gaussian_head: tokens and points to Gaussians.
-        rounds: correct the Gaussians of the Gaussian head, and need bounds; None: no rounds.
+        rounds: refine the Gaussians of the Gaussian head and require bounds; None: no rounds.
         skip: work to leave out; None: ``skip=exact``.
 
     Raises:
@@ -74,8 +74,8 @@ class GHGS(nn.Module):
 
         Args:
             batch: preprocessed: whole patches, in metres around the subject.
-            plan: of the batch; None: it is made now.
-            coarse: tokens and depths that smaller copies of the views gave; None: there are none.
+            plan: of the batch; None: computed here.
+            coarse: tokens and depths predicted from downsampled views; None: full resolution only.
 
         Returns:
             The prediction, with the tokens of the encoder.
@@ -100,22 +100,24 @@ class GHGS(nn.Module):
         return tokens.in_precision(next(parameters, tokens.semantic).dtype)
 
     def measure(self, batch: Batch, flags: Sequence[Bool[Tensor, ""]] = ()) -> MaskStatistics:
-        """What a plan reads, where it is: a function of tensors.
+        """Mask statistics from which :meth:`plan` is made, as tensors on the device of the masks.
 
         Args:
             batch: preprocessed.
-            flags: further values that are to be read with it.
+            flags: further values to copy to the host together with the statistics.
         """
         flags = [batch.cameras.any_skew, *flags]
         return MaskStatistics.of(batch.masks, self.encoder.patch_size, self.encoder.keeps(batch.masks), flags)
 
     def plan(self, batch: Batch, measured: MaskStatistics | None = None, least: Sizes | None = None) -> Plan:
-        """What the stages work on; the only device-to-host synchronisation before them.
+        """Patches, tokens and pixels that the stages compute.
+
+        This is the only device-to-host synchronisation before the stages.
 
         Args:
             batch: preprocessed.
-            measured: of the batch; None: it is measured now.
-            least: sizes that are kept as long as they are enough; None: those of the scene.
+            measured: result of :meth:`measure`; None: computed here.
+            least: sizes of a shape bucket, reused while they suffice; None: sizes of the scene.
         """
         targets = [] if batch.targets is None else [batch.targets.cameras]
         plan = make_plan(
@@ -134,17 +136,17 @@ class GHGS(nn.Module):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: bool = False) -> "GHGS":
-        """The model of a configuration.
+        """Builds the model of a configuration.
 
         Args:
-            config: nodes by their names: all of :data:`ghgs_lit.method.stages.STAGES`,
-                and of ``OPTIONS`` there any.
-            empty: on the meta device, to be given weights: a strange configuration then takes no
-                memory before they are compared with it.
+            config: nodes by name: all of :data:`ghgs_lit.method.stages.STAGES`,
+                and any of ``OPTIONS`` in the same module.
+            empty: build on the meta device, for weights that are loaded afterwards: a wrong configuration
+                then allocates no memory before it is compared with them.
 
         Raises:
-            InputError: a stage is missing, an option is unknown or out of range, or stages do not
-                fit each other.
+            InputError: a stage is missing, an option is unknown or out of range, or stages are
+                incompatible.
         """
         config = with_known_height(config, config)
         skip = read_node(config.get("skip") or {}, "skip")
@@ -172,19 +174,19 @@ class GHGS(nn.Module):
 
 
 def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
-    """Nodes of a model whose ``rounds.height`` is a number where it was ``auto``.
+    """Nodes of a model in which ``rounds.height: auto`` is replaced by a number of pixels.
 
     Args:
         nodes: of the model, by name, with or without rounds.
-        trained: configuration of its training,
-            whose ``data.size`` and ``augmentation.sizes`` are read.
+        trained: configuration of its training, of which ``data.size`` and ``augmentation.sizes``
+            are used.
 
     Returns:
         The nodes; without known sizes ``rounds.height`` is null.
     """
     rounds = nodes.get("rounds")
     rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
-    # not a user's own kind
+    # not a user-defined kind
     is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"
     if not is_known or rounds.get("height", "auto") != "auto":
         return dict(nodes)

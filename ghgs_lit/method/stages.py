@@ -1,4 +1,4 @@
-"""Interfaces of the stages of the method (paper, Figure 2), which a replacement must offer.
+"""Interfaces of the stages of the method (paper, Figure 2), which a replacement must implement.
 
 To replace a stage, register the options of a class under a new kind
 (:func:`ghgs_lit.config.register`). Stages with weights are modules (``torch.nn.Module``)."""
@@ -29,7 +29,7 @@ STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "g
 #: Stages with weights whose widths follow the encoder's.
 HEADS = ("depth_head", "recalibration", "gaussian_head")
 
-#: Nodes that a model may have beside its stages.
+#: Optional nodes of a model, in addition to its stages.
 OPTIONS = ("rounds", "skip", "model")
 
 
@@ -37,7 +37,7 @@ class Bounds(Protocol):
     """Near and far of each pixel's ray; options: ``build()``.
 
     Attributes:
-        is_bounded: false for a stage that gives None; it needs a depth head without bounds.
+        is_bounded: false if the stage returns None, which requires a depth head without bounds.
     """
 
     is_bounded: bool
@@ -46,7 +46,7 @@ class Bounds(Protocol):
         """Bounds of all pixels.
 
         Args:
-            batch: masks and cameras; photographs may have any size.
+            batch: masks and cameras are read; images may have any size.
 
         Returns:
             Near and far [B, V, H, W] in metres; None where ``is_bounded`` is false.
@@ -54,16 +54,16 @@ class Bounds(Protocol):
 
 
 class Encoder(Protocol):
-    """Photographs to tokens; options: ``build(tokens, margin)``,
-    which choose the patches (``conf/skip``).
+    """Input views to tokens; options: ``build(tokens, margin)``,
+    which select the patches (``conf/skip``).
 
     Attributes:
         dim_latent: width of a layer of the tokens.
         patch_size: side of a patch in pixels.
-        bounds_input: whether bounds are read.
+        bounds_input: whether bounds are an input.
         tokens: which patches have tokens; can be set later, as can ``margin``,
             and changes :meth:`keeps`.
-        margin: patches around these that have some, too.
+        margin: number of patches around these that also have tokens.
     """
 
     dim_latent: int
@@ -82,7 +82,7 @@ class Encoder(Protocol):
         """Tokens of the patches ``plan.kept``, in the order of image, row, column.
 
         Args:
-            images: photographs in [0, 1]; sides are divisible by ``patch_size``.
+            images: in [0, 1]; sides are divisible by ``patch_size``.
             masks: the subject's pixels.
             bounds: of all pixels, read where ``bounds_input``; None for stages without bounds.
             plan: which patches become tokens.
@@ -100,23 +100,23 @@ class DepthHead(Protocol):
     """Tokens to depths; options: ``build(dim_latent)``.
 
     Attributes:
-        is_bounded: whether depths lie between bounds, which are then needed.
+        is_bounded: whether depths lie between bounds, which are then required.
     """
 
     is_bounded: bool
 
     def __call__(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> DepthMaps:
-        """Depths of all pixels; those within ``plan.depth_windows`` at least have a meaning.
+        """Depths of all pixels; only those within ``plan.depth_windows`` need to be meaningful.
 
         Args:
             tokens: of the encoder.
-            batch: photographs, masks and cameras.
+            batch: images, masks and cameras are read.
             bounds: of all pixels; None where ``is_bounded`` is false.
             plan: where depths are needed.
 
         Returns:
-            Depths [B, V, H, W] in metres, between the bounds if there are any,
-            and which pixels are valid.
+            Depths [B, V, H, W] in metres, between the bounds if any,
+            and a mask of valid pixels.
         """
 
 
@@ -128,8 +128,8 @@ class Unprojection(Protocol):
 
         Args:
             depth_maps: in metres.
-            tokens: whose patches have points, too.
-            batch: cameras.
+            tokens: of the encoder; their patches get points, too.
+            batch: cameras are read.
         """
 
 
@@ -137,7 +137,8 @@ class Recalibration(Protocol):
     """Tokens to tokens; options: ``build(dim_latent)``.
 
     Attributes:
-        tokens: ``all`` with background tokens, for which all pixels need a depth; else ``subject``.
+        tokens: ``all``: background tokens are recalibrated, too, so that all pixels need a depth;
+            ``subject``: only tokens of the subject.
     """
 
     tokens: DecodedPixels
@@ -148,18 +149,18 @@ class Recalibration(Protocol):
         Args:
             tokens: of the encoder.
             points: of pixels and tokens in the world, in metres.
-            plan: its ``peers`` whose points are valid are recalibrated.
+            plan: tokens in ``peers`` with valid points are recalibrated.
         """
 
 
 class GaussianHead(Protocol):
     """Tokens to Gaussians in two steps; options: ``build(dim_latent)``.
 
-    The first step may give any type, but rounds need
+    The first step may return any type, but rounds require
     :class:`ghgs_lit.method.heads.attributes.RawGaussians`.
 
     Attributes:
-        channels: width of the descriptors of these.
+        channels: width of the descriptors in the raw attributes.
     """
 
     channels: int
@@ -167,17 +168,17 @@ class GaussianHead(Protocol):
     def __call__(
         self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps, plan: Plan
     ) -> Any:
-        """Raw attributes of the pixels ``plan.subject`` that are valid.
+        """Raw attributes of the valid pixels in ``plan.subject``.
 
         Args:
             tokens: recalibrated ones.
-            batch: photographs, masks and cameras.
+            batch: images, masks and cameras are read.
             points: of pixels in the world, in metres.
             depth_maps: in metres.
             plan: which pixels become Gaussians, and the windows to decode.
 
         Returns:
-            What :meth:`activate` takes.
+            The input of :meth:`activate`.
         """
 
     def activate(self, raw: Any, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
@@ -185,12 +186,12 @@ class GaussianHead(Protocol):
 
         Args:
             raw: result of the first step; rounds change it.
-            batch: photographs, mattes and cameras.
+            batch: images, mattes and cameras are read.
             points: of pixels in the world, in metres; rounds move them.
             depth_maps: in metres, of these points.
 
         Returns:
-            Gaussians with the pixels that they belong to.
+            Gaussians with the indices of their pixels.
         """
 
 
@@ -232,7 +233,7 @@ class Loss(Protocol):
         Args:
             prediction: of the model.
             rendering: of its Gaussians from the targets' cameras.
-            batch: photographs, targets and bodies and depths where the data has them.
+            batch: images and targets, and bodies and depths if the data set has them.
 
         Returns:
             The value, a scalar, and each term.
@@ -240,16 +241,16 @@ class Loss(Protocol):
 
 
 def require_bounds(bounds: Bounds, encoder: Encoder, depth_head: DepthHead, rounds: Any) -> None:
-    """Refuse stages that need bounds without them, and the reverse.
+    """Rejects stages that require bounds in a model without them, and vice versa.
 
     Args:
         bounds: stage of the bounds.
-        encoder: may read bounds.
-        depth_head: gives depths between bounds, or without.
-        rounds: need bounds; None: there are none.
+        encoder: may take bounds as an input.
+        depth_head: predicts depths with or without bounds.
+        rounds: require bounds; None: no rounds.
 
     Raises:
-        InputError: names the option that does not fit.
+        InputError: with the name of the incompatible option.
     """
     head = f"a depth head {'between' if depth_head.is_bounded else 'without'} bounds"
     expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"

@@ -36,7 +36,7 @@ def squared_error(
 
     Args:
         image: renders.
-        target: photographs in [0, 1].
+        target: images in [0, 1].
 
     Returns:
         Maps in float32 or wider."""
@@ -63,7 +63,7 @@ def psnr(
 
     Args:
         image: renders.
-        target: photographs in [0, 1].
+        target: images in [0, 1].
         region: the pixels that count; None: all.
 
     Returns:
@@ -82,7 +82,7 @@ def psnr_box_40(
 
     Args:
         image: renders.
-        target: photographs in [0, 1].
+        target: images in [0, 1].
         mask: of the subject.
 
     Returns:
@@ -127,7 +127,7 @@ def ssim_map(
 
     Args:
         image: renders.
-        target: photographs in [0, 1].
+        target: images in [0, 1].
         padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image
             averages these); the others keep the image's size: ``reflect`` mirrors the image at its
             border (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
@@ -167,8 +167,8 @@ def ssim(
 
     Args:
         image: renders.
-        target: photographs in [0, 1].
-        padding: as of :func:`ssim_map`.
+        target: images in [0, 1].
+        padding: as in :func:`ssim_map`.
         region: the pixels that count, where the map covers them; None: all.
 
     Returns:
@@ -186,7 +186,7 @@ def spill(
 
     Args:
         image: renders on black.
-        target: photographs on black, in [0, 1].
+        target: images on black, in [0, 1].
         mask: of the subject.
 
     Returns:
@@ -205,7 +205,7 @@ def sharpness(
 
     Args:
         image: renders.
-        target: photographs in [0, 1].
+        target: images in [0, 1].
         mask: of the subject.
 
     Returns:

@@ -83,7 +83,7 @@ class LPIPS:
 
         Args:
             image: renders; values outside of the network's range are clamped.
-            target: photographs in [0, 1].
+            target: images in [0, 1].
 
         Returns:
             A distance for each image."""

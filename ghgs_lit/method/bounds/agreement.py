@@ -40,7 +40,7 @@ def trusted_views(
         coarse: masks of at most :data:`RESOLUTION` cells along the longer side, and their cameras.
         center: of the subject in the world, in metres.
         reach: a generous radius of the subject about ``center``, in metres.
-        tolerance: how many views may say "outside" of a point that is kept.
+        tolerance: number of views in which a kept point may lie outside the mask.
 
     Returns:
         Which views vote.
@@ -63,22 +63,22 @@ def trusted_views(
 
 
 def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
-    """Votes of each view about points on the rays of all views.
+    """Outside-the-mask votes of each view for points on the rays of all views.
 
     Args:
         coarse: masks and their cameras.
-        voting: [B, V], views that may say "outside".
-        center: [B, 3], middle of the depths that are looked at, in metres.
+        voting: [B, V], views whose masks are used.
+        center: [B, 3], middle of the tested depths, in metres.
         reach: [B], half of their range, in metres.
 
     Returns:
-        Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v``
-        outside its mask.
+        Votes [B, v, o, h, w, S]: 1 where a point on a ray of view ``v`` projects outside
+        the mask of view ``o``.
     """
     masks = coarse.masks
     cameras = coarse.cameras
     b, v = voting.shape
-    # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
+    # At least one cell: the rays of a cell's pixels run next to the ray of its centre.
     outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting, coarse.cut)
     matrices = projection_matrices(cameras)
     middle = in_cameras(center, cameras.extrinsics)[..., 2]

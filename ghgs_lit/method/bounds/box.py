@@ -53,7 +53,7 @@ class SubjectBox(Options):
     dilation: float = Field(0.01, ge=0, lt=0.5)
     """Dilation of the masks, a fraction of the image's longer side; 0.02 to 0.03 for noisy masks"""
     tolerance: Index = 0
-    """Views that may say "outside" of a point that counts as inside"""
+    """Number of views in which a point of the subject may lie outside the mask"""
 
     @property
     def is_bounded(self) -> bool:
@@ -65,7 +65,7 @@ class SubjectBox(Options):
         """Bounds of all pixels, without a gradient.
 
         Args:
-            batch: masks and cameras are read; photographs may have any size.
+            batch: masks and cameras are read; images may have any size.
 
         Returns:
             Near and far [B, V, H, W] in metres: near is :data:`MIN_DEPTH` or more, far at least
@@ -99,7 +99,7 @@ class SubjectBox(Options):
         Args:
             batch: masks and cameras at full resolution.
             coarse: the same at a lower one.
-            voting: [B, V], views that may say "outside".
+            voting: [B, V], views whose masks are used.
             lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
             upper: [B, 3], that with the largest.
         """
@@ -129,7 +129,7 @@ def subject_box(
         masks: a view with an empty mask does not vote.
         cameras: [B, V], whose pixels are those of the masks.
         radius: dilation of the masks in pixels.
-        tolerance: how many views may say "outside" of a point that is kept.
+        tolerance: number of views in which a kept point may lie outside the mask.
         cut: sides of the frame that cut the subject; None: those that the masks touch.
 
     Returns:
@@ -165,11 +165,11 @@ def _carve(
     """Cells of a grid of :data:`CELLS` along each side that the views keep.
 
     Args:
-        outside: uint8 [B, V, h, w], 1 where a view says "outside".
+        outside: uint8 [B, V, h, w], 1 where a pixel of a voting view is outside the subject.
         cameras: [B, V], whose pixels are those of ``outside``.
         lower: [B, 3], the corner of the grid with the smallest coordinates, in metres.
         cell: [B, 3], sides of a cell in metres.
-        tolerance: how many views may say "outside" of a cell that is kept.
+        tolerance: number of views in which a kept cell may lie outside the mask.
     """
     steps = constant(torch.arange, CELLS, like=lower) + 0.5
     position = lower[..., None] + cell[..., None] * steps

@@ -33,18 +33,18 @@ class VisualHull(SubjectBox):
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
     ) -> DepthBounds:
-        """As of :class:`SubjectBox`, and for the subject's pixels within the hull.
+        """As in :class:`SubjectBox`, but within the hull for the subject's pixels.
 
         Args:
             batch: masks and cameras at full resolution.
             coarse: the same at a lower one, at which rays are marched.
-            voting: [B, V], views that may say "outside".
+            voting: [B, V], views whose masks are used.
             lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
             upper: [B, 3], that with the largest.
         """
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
-        # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
+        # At least one cell: the rays of a cell's pixels run next to the ray of its centre.
         radius = max(coarse.dilation, 1)
         rays = batch.pixels if coarse.stride == 1 else None
         count = bucket_size(sum(extent.cells(coarse.stride) for extent in batch.extents))
@@ -68,17 +68,17 @@ def hull_bounds(
 ) -> DepthBounds:
     """First and last depth within ``start`` that the dilated masks of the other views allow.
 
-    Pixels beside the subject, and rays that miss the hull, keep the bounds of ``start``.
+    Pixels outside the subject, and rays that miss the hull, keep the bounds of ``start``.
 
     Args:
         masks: the subject's pixels, whose rays are marched.
         cameras: [B, V], whose pixels are those of the masks.
         start: bounds [B, V, h, w] in metres, between which depths are tried.
         radius: dilation of the masks in pixels.
-        tolerance: how many other views may say "outside" of a depth that is allowed.
+        tolerance: number of other views in which an allowed depth may lie outside the mask.
         samples: depths that are tried along each ray.
         rays: indices of the masks' pixels, if known.
-        voting: views that may say "outside"; None: those whose mask is not empty.
+        voting: views whose masks are used; None: those whose mask is not empty.
         count: the masks have no more pixels than this, which avoids a device-to-host synchronisation;
             None: unknown.
         cut: sides of the frame that cut the subject; None: those that the masks touch.

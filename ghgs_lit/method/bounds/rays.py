@@ -1,4 +1,4 @@
-"""Rays of pixels, and masks as silhouettes: dilated, and looked up at projected points. A ray is a
+"""Rays of pixels, and masks as silhouettes: dilated, and sampled at projected points. A ray is a
 function of z-depth: ``point(z) = center + z * direction``."""
 
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ class Silhouettes:
         cameras: whose pixels are the cells.
         stride: side of a cell in pixels.
         dilation: of the masks, in cells.
-        cut: sides of the frame that cut the subject, as of :func:`cut_sides`.
+        cut: sides of the frame that cut the subject, as in :func:`cut_sides`.
     """
 
     masks: Bool[Tensor, "B V h w"]
@@ -182,16 +182,16 @@ def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor
 def votes_outside(
     dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"], cut: Bool[Tensor, "B V 4"]
 ) -> UInt8[Tensor, "B V h w"]:
-    """1 where a voting view says "outside the subject".
+    """1 where a pixel of a voting view is outside the subject.
 
-    Beyond a side of the frame that cuts the subject nothing was seen. Points there are looked up
-    at the nearest border pixel (:func:`look_up`), so that the border of such a side says
-    "outside" nowhere.
+    Beyond a side of the frame that cuts the subject nothing was observed. Points there are sampled
+    at the nearest border pixel (:func:`look_up`), so that the border of such a side is 0
+    everywhere.
 
     Args:
         dilated: masks, grown because real ones are noisy.
-        voting: the others say "outside" nowhere.
-        cut: sides that cut the subject, as of :func:`cut_sides`.
+        voting: values of other views are 0.
+        cut: sides that cut the subject, as in :func:`cut_sides`.
     """
     outside = dilated < voting[..., None, None]
     whole = ~cut

@@ -134,7 +134,7 @@ _GPU_HIDDEN = 1 << 28
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:
-    """Draw normal ``values`` in place, but not on the meta device,
+    """Samples normal ``values`` in place, but not on the meta device,
     where PyTorch would import its compiler.
 
     Args:

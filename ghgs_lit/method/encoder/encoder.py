@@ -1,4 +1,4 @@
-"""The encode stage: photographs and masks to tokens,
+"""The encode stage: input views and masks to tokens,
 by alternating attention inside and across views."""
 
 import re
@@ -33,7 +33,7 @@ _FIELDS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
 
 
 class PatchOptions(Options):
-    """Photographs to patch tokens."""
+    """Images to patch tokens."""
 
     group = "encoder.vit"
     kind: Literal["conv", "stem", "dinov2"]
@@ -58,7 +58,7 @@ class PatchOptions(Options):
 
 
 class VGGTOptions(Options):
-    """Photographs and masks to tokens, by VGGT of any size."""
+    """Input views and masks to tokens, by VGGT of any size."""
 
     group = "encoder"
     width: Width
@@ -70,7 +70,7 @@ class VGGTOptions(Options):
     layers: tuple[int, ...]
     """Pairs whose tokens are read out, ascending; the last pair is among them"""
     vit: PatchOptions
-    """Photographs to patch tokens"""
+    """Patch embedding: images to patch tokens"""
     patch_size: int = Field(14, ge=1, le=1024)
     """Side of a patch, pixels"""
     image_size: Side = 518
@@ -120,8 +120,8 @@ class VGGTOptions(Options):
         """The stage.
 
         Args:
-            tokens: as of :class:`VGGTEncoder`, as is the next.
-            margin: patches around these that are kept, too.
+            tokens: as for :class:`VGGTEncoder`.
+            margin: number of patches around these that are kept, too.
 
         Returns:
             The encoder with new weights.
@@ -176,7 +176,7 @@ class Aggregator(nn.Module):
 
         Args:
             images: [b, v, i, H, W] as ``patch_embed`` takes them.
-            kept: the patches that take part; all others are as if they did not exist.
+            kept: patches that are encoded; all others have no influence.
 
         Returns:
             Packed tokens [t, c], special ones included, after the frame block and after the global
@@ -217,8 +217,8 @@ class VGGTEncoder(nn.Module):
     Args:
         options: of the encoder.
         tokens: ``all``; ``window``: patches of the smallest rectangle that holds the subject;
-            ``subject``: patches with a pixel of the subject. Others leave before the first
-            block. Kept patches keep their positions; a view with an empty mask has its
+            ``subject``: patches with a pixel of the subject. All others are dropped before
+            the first block. Kept patches keep their positions; a view with an empty mask has its
             special tokens only.
         margin: patches around these that are kept, too.
     """
@@ -269,7 +269,7 @@ class VGGTEncoder(nn.Module):
         """Tokens of the patches ``plan.kept`` of all views.
 
         Args:
-            images: photographs [b, v, 3, H, W] in [0, 1], with sides divisible by the patch size.
+            images: [b, v, 3, H, W] in [0, 1], with sides divisible by the patch size.
             masks: [b, v, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, or
                 without a plan.
             bounds: in metres; read with ``bounds_input``.

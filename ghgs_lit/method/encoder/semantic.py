@@ -1,5 +1,5 @@
 """Semantic features F of encoders without published weights:
-the parts of the body that a patch shows."""
+the body parts visible in a patch."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -65,7 +65,7 @@ class SemanticBranch(nn.Module):
     coefficient): 1 where they are equal, 0 where no part is shared.
 
     Attention is inside a view, among a learned token and the patches with a pixel of the
-    subject. Every choice of ``skip.tokens`` keeps these, so features depend on one photograph
+    subject. Every choice of ``skip.tokens`` keeps these, so features depend on one image
     and its mask alone."""
 
     def __init__(self, options: SemanticOptions, patch_size: int):
@@ -94,7 +94,7 @@ class SemanticBranch(nn.Module):
         """Logarithms of the shares of parts in patches.
 
         Args:
-            images: photographs [b, v, 3, H, W] in [0, 1].
+            images: [b, v, 3, H, W] in [0, 1].
             masks: of the subject [b, v, H, W].
             kept: the patches of :meth:`subject`, or some of them.
 
@@ -115,12 +115,12 @@ class SemanticBranch(nn.Module):
         """Features of the kept patches.
 
         Args:
-            images: photographs [b, v, 3, H, W] in [0, 1].
+            images: [b, v, 3, H, W] in [0, 1].
             masks: of the subject [b, v, H, W].
             plan: its ``kept`` have features, its ``shown_patches`` are computed.
 
         Returns:
-            Features [N, p]; 0 (cosine 0 with all others) where no subject is shown.
+            Features [N, p]; 0 (cosine 0 with all others) in patches without the subject.
         """
         shown = plan.shown_patches
         features = features_of(self.log_shares(images, masks, shown))

@@ -36,8 +36,8 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-#: Patches around a kept one that it depends on: the next one is mixed in,
-#: which sees a part of its neighbour.
+#: Patches around a kept one that it depends on: the adjacent one is mixed in,
+#: whose receptive field reaches into its neighbour.
 _REACH = 2
 
 
@@ -113,7 +113,7 @@ class VisionTransformer(nn.Module):
         self.patch_size = patch_size
         self.special = 1 + REGISTERS
         self.checkpointing = checkpointing
-        #: ``cache(dense, images)`` gives tokens of known photographs; None: all are computed.
+        #: ``cache(dense, images)`` returns tokens of cached images; None: all are computed.
         self.cache: Callable[..., Tensor] | None = None
         self.patch_embed = PatchEmbed(in_channels, width, patch_size)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))

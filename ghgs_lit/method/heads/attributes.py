@@ -1,4 +1,4 @@
-"""Raw attributes of Gaussians, and what they mean: in footprints of pixels,
+"""Raw attributes of Gaussians and their activations: in footprints of pixels,
 or as in the authors' release."""
 
 import dataclasses
@@ -18,7 +18,7 @@ from ghgs_lit.ops.activation import (
 )
 
 #: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1
-#: where there is no limit; and the limit where none is said.
+#: where there is no limit; and the default limit.
 OFFSET_UNIT = 0.05
 #: The largest scale in footprints: a splat as large as a limb would hide errors beneath it.
 SCALE_CAP = 4.0
@@ -94,7 +94,7 @@ class FootprintAttributes(Options):
     """Scale of the third axis at which training starts, in footprints; null: as the others."""
     inward: Amount = 0.0
     """Distance along the third axis to which training starts moving the splats, in footprints: with
-    axes of the surface, away from the camera. What a splat covers beside its pixel then ends at the
+    axes of the surface, away from the camera. The part of a splat outside its pixel then ends at the
     silhouette."""
     opacity_floor: Share = 0.1
     """Least opacity: below 1/255 a splat has no gradient left."""

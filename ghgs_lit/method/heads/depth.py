@@ -71,10 +71,10 @@ class DepthHeadOptions(Options):
     """Residual units add what they rectified, as published weights expect;
     in training it can die."""
     guide: bool = False
-    """The dense head also sees photographs, masks and bounds at full resolution;
+    """Adds images, masks and bounds at full resolution to the input of the dense head;
     the paper: false."""
     consistency_depths: int = Field(0, ge=0, le=4096)
-    """Depths between near and far at which the guide shows photo-consistency; the paper: 0."""
+    """Number of depths between near and far whose photo-consistency is added to the guide; the paper: 0."""
     parameterization: Literal["bounded_inverse", "linear", "inverse_linear"] = "bounded_inverse"
     """bounded_inverse, linear: in 1 / z or in z between the near and far of each pixel;
     inverse_linear: without bounds, for the authors' weights only."""
@@ -123,7 +123,7 @@ class DepthHead(nn.Module):
 
         Args:
             tokens: of the encoder.
-            batch: photographs, masks and cameras are read.
+            batch: images, masks and cameras are read.
             bounds: in metres; None if :attr:`is_bounded` is false.
             plan: only its ``depth_windows`` are decoded, and other depths have no meaning.
 
@@ -152,7 +152,7 @@ def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBo
 
     Args:
         depth: [B, V, H, W] in metres.
-        batch: its masks say which pixels are valid.
+        batch: its masks define the valid pixels.
         confidence: [B, V, H, W].
         bounds: that the depths lie between; None: none.
     """

@@ -190,7 +190,7 @@ class Scratch(nn.Module):
         features: channels of the fused maps.
         hidden: channels before the last convolution.
         output_dim: channels of the result.
-        rectified_skip: as of :class:`ResidualUnit`.
+        rectified_skip: as in :class:`ResidualUnit`.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class LevelWindows:
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows that a head computes for the window ``result`` of its result. Zero padding spoils
+    """Windows that a head computes for the window ``result`` of its result. Zero padding corrupts
     the border of a window, so each is larger than needed by the reach of its layers, as far as
     the map goes."""
 
@@ -233,7 +233,7 @@ class DPTHead(nn.Module):
     Args:
         dim_latent: width of a token of ``Tokens.latent``.
         output_dim: channels of the result.
-        rectified_skip: as of :class:`ResidualUnit`.
+        rectified_skip: as in :class:`ResidualUnit`.
         guide_channels: channels of a guide at full resolution (:mod:`ghgs_lit.method.heads.guide`), which
             keeps a small head sharp; 0: none, as published.
         widths: channels inside; None: :func:`published_widths`.
@@ -277,7 +277,7 @@ class DPTHead(nn.Module):
             return self._maps(tokens, guide, window)
 
     def _maps(self, tokens: Tokens, guide: Guide | None, window: Window | None) -> Tensor:
-        """:meth:`forward` in the precision that is left;
+        """:meth:`forward` in the current precision;
         levels are computed from coarse to fine."""
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)

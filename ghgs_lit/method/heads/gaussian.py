@@ -72,10 +72,10 @@ class GaussianHeadOptions(Options):
     """Residual units add what they rectified, as published weights expect;
     in training it can die."""
     guide: bool = False
-    """The dense head also sees photographs, masks and depths at full resolution;
+    """Adds images, masks and depths at full resolution to the input of the dense head;
     the paper: false."""
     photo_consistency: bool = False
-    """The guide shows photo-consistency at the predicted depth: a splat off the surface can become
+    """Adds photo-consistency at the predicted depth to the guide: a splat off the surface can become
     transparent; the paper: false."""
     color_limit: Share = 0.0
     """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of
@@ -84,9 +84,10 @@ class GaussianHeadOptions(Options):
     """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: none,
     as published. With parameterization=footprint; release has none."""
     low_pass: Amount = 0.3
-    """px^2 that splats are made to be widened by when they are drawn; gsplat's default."""
+    """Low-pass filter of the renderer that splats are predicted for, in px^2; 0.3: gsplat's default."""
     antialiased: bool = False
-    """Splats are made to lose the opacity that this adds (Mip-Splatting)."""
+    """Predict splats for a renderer that compensates the opacity added by the low-pass filter
+    (Mip-Splatting)."""
     channels: Width = 32
     """Width of the descriptor of a pixel (32 as published)."""
     hidden: tuple[Width, Width] = (128, 32)
@@ -159,7 +160,7 @@ class GaussianHead(nn.Module):
 
         Args:
             tokens: recalibrated ones.
-            batch: photographs, masks and cameras are read.
+            batch: images, masks and cameras are read.
             points: which pixels have a valid point.
             depth_maps: in metres, read by a guide.
             plan: its ``windows`` and the subject's pixels are computed; with ``pixels="all"`` every
@@ -182,7 +183,7 @@ class GaussianHead(nn.Module):
 
         Args:
             raw: of :meth:`forward`; rounds change them.
-            batch: photographs, mattes and cameras are read.
+            batch: images, mattes and cameras are read.
             points: of pixels in the world, in metres.
             depth_maps: in metres, of these points.
         """

@@ -1,6 +1,5 @@
-"""Guides: further input of a dense head at full resolution, of photographs, masks and
-depths. A patch is one token, so a head that sees only tokens draws soft edges. Published
-weights use no guide."""
+"""Guides: full-resolution inputs of a dense head (images, masks and depths). A patch is one
+token, so a head whose only input is tokens predicts soft edges. Published weights use no guide."""
 
 import functools
 
@@ -23,10 +22,10 @@ Guide = tuple[Float[Tensor, "n _ H W"], ...]
 
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
-    """Photographs, masks or mattes, and further maps of all images.
+    """Images, masks or mattes, and further maps of all input views.
 
     Args:
-        batch: photographs, masks and mattes are read.
+        batch: images, masks and mattes are read.
         maps: further ones, with any number of channels.
     """
     images = at_least_float32(batch.images)

@@ -1,4 +1,4 @@
-"""What the Gaussian head has put out, for inspection; predictions do not use it."""
+"""Outputs of the Gaussian head, for inspection; predictions do not use them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,14 +18,14 @@ NEAR_LIMIT = 0.95
 
 @contextmanager
 def seen_attributes(head: nn.Module | None) -> Iterator[list[RawGaussians]]:
-    """Collect the raw attributes that a head makes Gaussians of, while the context lasts.
+    """Collects the raw attributes that a head activates within the context.
 
     Args:
-        head: The stage; of one's own, or of a model without it, nothing is collected.
+        head: The stage; for None or a custom head, nothing is collected.
 
     Yields:
         Raw attributes in the order of calls. The last ones are those of the prediction: rounds
-        change them, and smaller copies of photographs go through the stages first.
+        change them, and downsampled images pass through the stages first.
     """
     seen: list[RawGaussians] = []
     if not isinstance(head, GaussianHead):
@@ -54,7 +54,7 @@ def offsets_at_limit(raw: RawGaussians) -> Float[Tensor, ""]:
     Returns:
         Share, in [0, 1], of the Gaussians that are moved along an axis by more than ``NEAR_LIMIT``
         of the limit; 0 without Gaussians. Such offsets have lost nine tenths of their gradient, and
-        the surface that they look for may lie beyond the limit.
+        the surface may lie beyond the limit.
     """
     at_limit = (bounded_tanh(raw.offset).abs() > NEAR_LIMIT).any(-1)
     return at_limit.sum() / max(len(at_limit), 1)

@@ -1,6 +1,6 @@
 """Sequences of different lengths packed into one tensor: views keep different numbers of patches.
 Only the attention of a block mixes tokens, so views need no padding. Where shapes must repeat, on a
-GPU, each view's rows are filled up to a shape bucket, and nothing attends to what fills them."""
+GPU, each view's rows are padded to a shape bucket, and nothing attends to the padding."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -22,7 +22,7 @@ class KeptPatches:
     Args:
         kept: on any device.
         device: that of the tokens.
-        known: the extent of the kept patches of each image; None: it is read from ``kept``.
+        known: the extent of the kept patches of each image; None: computed from ``kept``.
         size: number of rows of each image, at least that of its kept patches: others repeat its
             last one (the first of all patches where none is kept); None: those that are kept.
 

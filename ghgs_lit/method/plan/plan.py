@@ -1,5 +1,5 @@
-"""The plan of a batch, and the one place where a prediction reads from a GPU what its
-masks hold."""
+"""The plan of a batch, and the one place where a prediction copies mask statistics from a GPU
+to the host."""
 
 import dataclasses
 import functools
@@ -20,19 +20,19 @@ from ghgs_lit.method.plan.rows import Rows, rounds_up
 from ghgs_lit.method.plan.window import Span, Window, subject_windows
 from ghgs_lit.types import DecodedPixels, Prediction
 
-#: Room that sizes get where those before were too small.
+#: Factor by which sizes exceed the need after earlier ones were too small.
 _SPARE = 1.15
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """A shape bucket: what is the same for all scenes of it.
+    """A shape bucket: sizes that all its scenes share.
 
     Attributes:
         pixels: rows of the subject's pixels, of each element.
         peers: rows of the tokens that are recalibrated, of each element.
-        kept: rows of the patches that become tokens, of each image; 0: all patches do.
-        shown: rows of the patches that show the subject, of each image.
+        kept: rows of the kept patches, of each image; 0: all patches.
+        shown: rows of the foreground patches, of each image.
         window: patches in which every subject lies.
     """
 
@@ -45,7 +45,7 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the stages work on.
+    """Patches, tokens and pixels that the stages compute.
 
     Attributes:
         masks: the subject's pixels.
@@ -56,7 +56,7 @@ class Plan:
         patch_size: in pixels.
         pixels: pixels that dense heads decode; ``all``: whole views.
         tokens: tokens that are recalibrated;
-            ``all``: with those of the background, which need depths, too.
+            ``all``: including the background's, which need depths, too.
         flags: values of further tensors that were read with the masks.
         sizes: numbers of rows, and windows (:mod:`ghgs_lit.method.plan.rows`); None: those of the scene."""
 
@@ -177,21 +177,21 @@ class Plan:
 
 
 def _of_elements(extents: Sequence[Extent], views: int) -> tuple[int, ...]:
-    """Sums of the counts of each element's images."""
+    """Sums of counts over the images of each element."""
     each = [extent.count for extent in extents]
     return tuple([sum(each[first : first + views]) for first in range(0, len(each), views)])
 
 
 @dataclass(frozen=True)
 class MaskStatistics:
-    """What a plan reads of masks, where they are: a function of tensors, before anything is read.
+    """Statistics of masks from which a plan is made, as tensors on their device.
 
     Attributes:
         shown: patches with a pixel of the subject.
         kept: patches that become tokens.
         numbers: of the patches ``shown``, then :func:`ghgs_lit.extents.extent_numbers` of the masks
             and of ``kept``.
-        flags: further values that are read with them.
+        flags: further values that are copied to the host with them.
     """
 
     shown: Bool[Tensor, "B V h w"]
@@ -213,7 +213,7 @@ class MaskStatistics:
             masks: the subject's pixels; sides are divisible by the patch size.
             patch_size: in pixels.
             kept: patches that become tokens.
-            flags: further values that are read with them.
+            flags: further values that are copied to the host with them.
         """
         shown = patches_around_subject(masks, patch_size, 0)
         extents = (extent_numbers(masks.flatten(0, 1)), extent_numbers(kept.flatten(0, 1)))
@@ -239,8 +239,8 @@ def make_plan(
         pixels: of the preset.
         tokens: which ones the recalibration works on.
         flags: tensors whose values are to be read with the statistics, and after them.
-        in_buckets: whether sizes are rounded up to shape buckets; None: as the masks' device needs it.
-        least: sizes that are kept as long as they are enough; None: those of the scene.
+        in_buckets: whether sizes are rounded up to shape buckets; None: on a GPU only.
+        least: sizes of a shape bucket, reused while they suffice; None: sizes of the scene.
     """
     of_masks = kept if isinstance(kept, MaskStatistics) else MaskStatistics.of(masks, patch_size, kept)
     flags = (*of_masks.flags, *flags)
@@ -281,10 +281,10 @@ def _bucket(
         shape: of the masks [B, V, H, W].
         patch_size: in pixels.
         extents: of the masks.
-        shown: of the patches that show the subject.
+        shown: of the foreground patches.
         kept: numbers of the patches that become tokens, of each image; empty: all do.
         tokens: which ones the recalibration works on.
-        least: sizes that are kept as long as they are enough.
+        least: sizes that are reused while they suffice.
     """
 
     def rows(name: str, counts: Sequence[int], most: int) -> int:

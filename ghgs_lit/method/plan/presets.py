@@ -27,7 +27,7 @@ class KeptTokens(NamedTuple):
 
 @contextmanager
 def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
-    """Let an encoder work on other patches while the context lasts.
+    """Changes the patches that an encoder keeps within the context.
 
     Args:
         encoder: a :class:`ghgs_lit.method.encoder.VGGTEncoder`.
@@ -42,7 +42,7 @@ def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
 
 
 class SkipOptions(Options):
-    """What is left out of the work, and what that may cost."""
+    """Patches and pixels that are not computed, and the accuracy that this may cost."""
 
     group = "skip"
     name: Text = "exact"
@@ -56,9 +56,9 @@ class SkipOptions(Options):
     """Pixels that the dense heads decode: whole views, or windows around the subject. The depth
     head decodes all where recalibration.tokens=all: all tokens need a depth."""
     budget_db: float | None = 0.001
-    """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it);
+    """Largest allowed loss of PSNR compared with skip=none, in dB (`ghgs benchmark` checks it);
     null: no promise."""
     max_rel_diff: Amount | None = 1e-5
     """Largest difference of 99 of 100 values of an attribute or a render from skip=none, as a share
-    of the largest value, times what the model amplifies one rounding of the photographs by;
+    of the largest value, times the factor by which the model amplifies one rounding of the images;
     `ghgs benchmark` checks it. null: nothing is promised."""

@@ -1,4 +1,4 @@
-"""Rows that count: the pixels or tokens of a batch that a stage works on,
+"""Rows: the valid pixels or tokens of a batch that a stage computes,
 as indices of known number."""
 
 import dataclasses
@@ -13,8 +13,8 @@ from ghgs_lit.extents import true_places
 
 
 def rounds_up(device: torch.device) -> bool:
-    """Whether numbers of rows are rounded up to shape buckets: a GPU repeats shapes,
-    a CPU computes what counts."""
+    """Whether numbers of rows are rounded up to shape buckets: on a GPU shapes
+    repeat, on a CPU only valid rows are computed."""
     return device.type != "cpu"
 
 
@@ -22,15 +22,15 @@ def rounds_up(device: torch.device) -> bool:
 class Rows:
     """Rows of each group (an image, or an element of the batch), one group after another.
 
-    Exact rows (``real`` is None) are those that count. Filled ones have the same number in each
-    group: what counts comes first, then its last row is repeated, or the group's
-    first row if none counts.
+    Exact rows (``real`` is None) are all valid. Filled ones have the same number in each group:
+    valid rows come first, then the last of them is repeated, or the group's first row if none
+    is valid.
 
     Attributes:
         index: places of the rows among all pixels or tokens, ascending within a group.
         counts: number of rows of each group.
         images: number of images of a group.
-        real: which rows count; None: all."""
+        real: which rows are valid; None: all."""
 
     index: Int[Tensor, " n"]
     counts: tuple[int, ...]
@@ -39,22 +39,22 @@ class Rows:
 
     @classmethod
     def exact(cls, wanted: Bool[Tensor, "..."], counts: Sequence[int], images: int) -> "Rows":
-        """The rows that are wanted.
+        """Rows of the selected pixels or tokens.
 
         Args:
             wanted: pixels or tokens, group by group.
-            counts: how many of each group are wanted.
+            counts: number of selected ones in each group.
             images: number of images of a group.
         """
         return cls(true_places(wanted, sum(counts)), tuple(counts), images)
 
     @classmethod
     def filled(cls, wanted: Bool[Tensor, "g m"], size: int, images: int) -> "Rows":
-        """The rows that are wanted, filled up to ``size`` in each group.
+        """Rows of the selected pixels or tokens, padded to ``size`` in each group.
 
         Args:
             wanted: m pixels or tokens of each of g groups.
-            size: number of rows of each group, at least that of the wanted ones.
+            size: number of rows of each group, at least that of the selected ones.
             images: number of images of a group.
         """
         groups, of_group = wanted.shape
@@ -63,7 +63,7 @@ class Rows:
         ranks = wanted.flatten().cumsum(0).view_as(wanted)
         if groups > 1:
             ranks = ranks - (ranks[:, :1] - wanted[:, :1].long())
-        # The n-th row that counts goes to place n from 1 on, and 0 for all others to place 0.
+        # The n-th valid row goes to place n, counted from 1; all others write 0 to place 0.
         places = number.new_zeros(groups, size + 1).scatter_(1, ranks * wanted, number * wanted)
         total = ranks[:, -1:]
         order = torch.arange(1, size + 1, device=wanted.device)
@@ -73,7 +73,7 @@ class Rows:
         return cls(index.flatten(), (size,) * groups, images, (order <= total).flatten())
 
     def only(self, valid: Bool[Tensor, "..."]) -> "Rows":
-        """The rows that are valid: others are left out, or no longer real where rows are filled.
+        """The valid rows: others are dropped or, in filled rows, marked as not real.
 
         Args:
             valid: of all pixels or tokens, in any shape.
@@ -88,7 +88,7 @@ class Rows:
 
     @property
     def tables(self) -> list[tuple[Int[Tensor, "*g n"], Bool[Tensor, "*g n"] | None]]:
-        """Indices in tables of equally many rows, and which of these count: one table for each group,
+        """Indices in tables of equally many rows, and which of these are valid: one table for each group,
         or one for all of filled rows."""
         if self.real is None:
             return [(part, None) for part in self.index.split(self.counts)]
@@ -103,7 +103,7 @@ class Rows:
     def put(
         self, values: Sequence[Float[Tensor, "t _"]], new: Sequence[Float[Tensor, "n _"]]
     ) -> tuple[Float[Tensor, "t _"], ...]:
-        """Tensors of all pixels or tokens with new values in the rows that count.
+        """Tensors of all pixels or tokens with new values in the valid rows.
 
         Args:
             values: of all pixels or tokens.
@@ -124,10 +124,10 @@ class Rows:
             total: number of pixels or tokens.
 
         Returns:
-            Which of them are rows that count, and the number of each one's row; 0 for others.
+            Which of them belong to a valid row, and the number of that row; 0 for others.
         """
         numbers = torch.arange(len(self.index), device=self.index.device)
-        # Rows that do not count go to one place more, which is cut off.
+        # Invalid rows go to one extra place, which is cut off.
         target = self.index if self.real is None else torch.where(self.real, self.index, total)
         row_of = numbers.new_full((total + 1,), -1).scatter_(0, target, numbers)[:total]
         return row_of >= 0, row_of.clamp(min=0)

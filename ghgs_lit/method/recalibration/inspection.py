@@ -39,7 +39,7 @@ def attention_of(
         query: index of the packed token.
 
     Returns:
-        Its neighbours and weights; None if it takes no part.
+        Its neighbours and weights; None if the token is not recalibrated.
     """
     takes_part = recalibration.takes_part(points)
     if not takes_part[query]:
@@ -55,7 +55,7 @@ def attention_of(
 
 @dataclass(frozen=True)
 class Overlap:
-    """Whom the tokens of an element attend to. ``tokens``: that take part. ``neighbors``: of each,
+    """Neighbourhood size in an element. ``tokens``: number that take part. ``neighbors``: of each,
     itself included. ``shared``: share of the neighbours that stay the same in the other setting of
     ``recalibration.neighborhood``; with nearly all tokens as neighbours that is nearly 1, and the
     ablation of 3D unprojection hardly changes anything."""
@@ -98,15 +98,15 @@ Call = tuple[Recalibration, Tokens, Points]
 
 @contextmanager
 def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
-    """Calls of the stage while the context lasts.
+    """Collects the inputs of the stage's calls within the context.
 
-    Nothing is computed, so that what is timed takes no longer.
+    Nothing is computed, so that measured run times are unaffected.
 
     Args:
         recalibration: the stage; None, or one without neighbours: the list stays empty.
 
     Yields:
-        A list that gets the inputs of each call.
+        A list to which the inputs of each call are appended.
     """
     calls: list[Call] = []
     if not isinstance(recalibration, Recalibration):

@@ -49,8 +49,8 @@ class RecalibrationOptions(Options):
     tokens: Literal["subject", "all"] = "subject"
     """Tokens that take part: subject, those with a point on the subject | all (the release)"""
     positions: Literal["none", "relative"] = "none"
-    """What values of attention know of places: none (the paper) | relative: where each neighbour
-    lies from the token, in units of the subject (not the paper's; with neighborhood=xyz)"""
+    """Positional information in the attention values: none (the paper) | relative: offset of each
+    neighbour from the token, in units of the subject (not in the paper; with neighborhood=xyz)"""
 
     @model_validator(mode="after")
     def _places_are_3d(self) -> "RecalibrationOptions":
@@ -68,12 +68,12 @@ class RecalibrationOptions(Options):
 
 
 class Neighborhood(NamedTuple):
-    """Whom n tokens attend to.
+    """Neighbours that n tokens attend to.
 
     Attributes:
-        near: their neighbours, as indices among them.
-        cosines: of their semantic features and the neighbours'; None: similarity is ignored (s = 1).
-        left_out: -inf where a neighbour does not count, else 0; None: all count.
+        near: neighbours of each token, as indices into the n tokens.
+        cosines: of the semantic features of token and neighbour; None: similarity is ignored (s = 1).
+        left_out: added to the logits: -inf for an invalid neighbour, else 0; None: all are valid.
         places: of the tokens, in units of the subject; None: values do not depend on places.
     """
 
@@ -93,13 +93,13 @@ class SemanticAttention(nn.Module):
             ``product`` multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors'
             release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar
             neighbours instead of pulling their logit to 0, ``none`` ignores it (s = 1).
-        has_places: whether the value of a neighbour also depends on where it lies from the query,
-            by a linear map of the difference of their places that starts at 0 (not the
-            paper's). By linearity that is the map of a head's mean place minus the query's:
+        has_places: whether the value of a neighbour also depends on its position relative to the query,
+            by a linear map of the difference that is initialised to 0 (not in the paper). By
+            linearity that equals the map of a head's mean position minus the query's, which needs
             no tensor of all pairs.
 
     Raises:
-        InputError: the heads do not divide C / 4."""
+        InputError: ``num_heads`` does not divide C / 4."""
 
     def __init__(
         self, dim: int, num_heads: int = 8, similarity: Similarity = "product", has_places: bool = False
@@ -126,7 +126,7 @@ class SemanticAttention(nn.Module):
         """Recalibrated tokens (Eqs. 3 and 5): keys and values of all first, then the tokens in parts.
 
         Args:
-            x: the tokens of an element, or of several.
+            x: tokens of one or several elements.
             neighborhood: of these tokens.
         """
         near, cosines, left_out, places = neighborhood
@@ -157,7 +157,7 @@ class SemanticAttention(nn.Module):
         return in_parts(recalibrate, len(x), most)
 
     def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> tuple[Tensor | None, Tensor | None]:
-        """What the semantic similarity multiplies a logit by, and what it adds; None: nothing.
+        """Factor and summand of the logits due to the semantic similarity; None: no change.
 
         Args:
             cosines: of tokens and neighbours, in [-1, 1]; None: similarity is ignored (s = 1).
@@ -169,12 +169,12 @@ class SemanticAttention(nn.Module):
         return cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines, None
 
     def _with_places(self, v: Float[Tensor, "n i"], places: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
-        """Values with the place of their token behind the channels of each head, j = i + 3 a."""
+        """Values, with the token's position appended to the channels of each head, j = i + 3 a."""
         heads = v.unflatten(1, (self.num_heads, -1))
         return torch.cat((heads, places[:, None].expand(-1, self.num_heads, -1)), dim=-1).flatten(1)
 
     def _moved(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
-        """Weighted values of :meth:`_with_places` with what the neighbours' places add to them."""
+        """Weighted values of :meth:`_with_places`, plus the contribution of the neighbours' positions."""
         values, mean = y.unflatten(1, (self.num_heads, -1)).tensor_split([-3], dim=-1)
         weight = self.place_proj.weight.to(y.dtype).unflatten(0, (self.num_heads, -1))
         with exact(y.device.type):
@@ -198,7 +198,7 @@ class Recalibration(nn.Module):
         Args:
             tokens: of the encoder.
             points: of these tokens in the subject's frame.
-            plan: its ``peers`` take part if their points are valid, or if all tokens do.
+            plan: tokens in ``peers`` take part if their points are valid, or always with ``tokens="all"``.
 
         Returns:
             Tokens of the same shapes and precision.
@@ -221,13 +221,13 @@ class Recalibration(nn.Module):
         index: Int[Tensor, "*g n"],
         real: Bool[Tensor, "*g n"] | None = None,
     ) -> Neighborhood:
-        """Whom some tokens of an element attend to, or of several elements (Eq. 4).
+        """Neighbours that tokens of one or several elements attend to (Eq. 4).
 
         Args:
             tokens: of the encoder.
             points: of these tokens.
             index: of the tokens, by element.
-            real: which of these count; the others are out of reach. None: all.
+            real: which of these are valid; no token attends to the others. None: all.
         """
         n = index.shape[-1]
         places = None
@@ -290,11 +290,11 @@ def neighbor_count(k: int | float, tokens: int) -> int:
     """Neighbours of each of an element's tokens.
 
     Args:
-        k: their number, or below 1 a share of the tokens.
-        tokens: of the element, that take part.
+        k: number of neighbours or, below 1, a share of the tokens.
+        tokens: number of the element's tokens that take part.
 
     Returns:
-        1 or more; a number ``k`` may exceed that of the tokens.
+        At least 1; a number ``k`` may exceed the number of tokens.
     """
     return max(round(k * tokens), 1) if k < 1 else int(k)
 

@@ -1,12 +1,11 @@
-"""Coarse to fine: what is found in smaller copies of the photographs is where the rounds at
-full size start.
+"""Coarse to fine: predictions from downsampled views initialise the rounds at full size.
 
-The stages judge a pixel by what they see around it, in pixels. Where a person is taller than in
-training they see less of it and place it worse. So the whole method runs once on copies in which
-the subject has the height that the weights know. Its depths are refined at full size, as in
+The stages have a receptive field of a fixed number of pixels. If a person is taller than in
+training, the field covers less of it and depths are less accurate. So the whole method runs once
+on copies in which the subject has the height of the training. Its depths are refined at full size, as in
 cascades of cost volumes (CasMVSNet, Gu et al., CVPR 2020), and its tokens are those of the encoder
-at full size, which does not run there. What is decided here depends on an element's own masks and
-the size of the photographs alone.
+at full size, which does not run there. All decisions depend only on an element's own masks and
+the size of the images.
 """
 
 import dataclasses
@@ -26,8 +25,8 @@ from ghgs_lit.geometry.projection import at_least_float32, pixel_centers
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens, map_tensors
 
-#: Share of a photograph's side that a person fills in training.
-#: In photographs of that size nothing changes.
+#: Share of an image's side that a person fills in training.
+#: In images of that size nothing changes.
 FILLED = 0.8
 #: First step of the rounds in depth, in those of rounds after a depth head:
 #: a coarse depth is nearly right.
@@ -41,7 +40,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class CoarseDepths:
-    """Depths that coarse predictions found for some elements of a batch.
+    """Depths of coarse predictions for some elements of a batch.
 
     Attributes:
         depth: in metres; meaningless in other elements.
@@ -72,10 +71,10 @@ class CoarseDepths:
         return constant(torch.tensor, self.elements, like=self.depth, dtype=torch.bool)
 
     def maps(self, batch: Batch, bounds: DepthBounds, others: DepthMaps | None = None) -> DepthMaps:
-        """The depths within bounds, in the middle where nothing is known.
+        """The depths within bounds; the middle of the bounds where depth is unknown.
 
         Args:
-            batch: its masks say which pixels are valid.
+            batch: its masks define the valid pixels.
             bounds: in metres.
             others: depths of the elements without coarse ones; None: all elements have some.
         """
@@ -94,7 +93,7 @@ class CoarseDepths:
 
 @dataclass(frozen=True)
 class Coarse:
-    """What predictions of smaller copies give to those at full size.
+    """Results of predictions from downsampled views that are used at full size.
 
     Attributes:
         depths: of the elements that have copies.
@@ -106,18 +105,18 @@ class Coarse:
     tokens: Tokens
 
     def encoder(self, encoder: Callable[..., Tokens]) -> Callable[..., Tokens]:
-        """An encoder that gives the tokens of the copies where there are any.
+        """An encoder that returns the tokens of the copies for elements that have one.
 
         Args:
-            encoder: gives those of elements without a copy; called if there are any.
+            encoder: of all other elements; called only if there are any.
         """
         return functools.partial(self._encoded, encoder)
 
     def depth_head(self, head: Callable[..., DepthMaps]) -> Callable[..., DepthMaps]:
-        """A depth head that gives the depths of the copies where there are any.
+        """A depth head that returns the depths of the copies for elements that have one.
 
         Args:
-            head: gives those of elements without a copy; called if there are any.
+            head: of all other elements; called only if there are any.
         """
         return functools.partial(self._decoded, head)
 
@@ -160,16 +159,16 @@ def coarse_of(
     least_matte: float | None,
     predict: Callable[[Batch], Prediction],
 ) -> Coarse | None:
-    """What is found in smaller copies of the photographs;
-    None where no subject is so tall as to need them.
+    """Predictions from downsampled views;
+    None if no subject is taller than in training.
 
     Args:
-        batch: as the stages see it, with or without a border around the photographs.
-        height: pixels of the subject's height, or of its width if larger, that the weights know.
+        batch: preprocessed, with or without a border around the images.
+        height: the subject's height in training in pixels, or its width if larger.
         patch_size: of the encoder, in pixels; sides of the copies are its multiples.
         least_matte: share of a pixel above which it belongs to the subject, 0 to 0.5; None:
-            there are none.
-        predict: gives the prediction of a batch, with the tokens of the encoder.
+            no mattes.
+        predict: returns the prediction of a batch, with the tokens of the encoder.
 
     Returns:
         Depths in metres and tokens at the size of ``batch``.
@@ -201,12 +200,12 @@ def coarse_of(
 def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:
     """The size of each element's smaller copy; None for elements that need none.
 
-    Those do whose subject is taller than the weights know, in photographs larger than those of the
-    training, which subjects may fill: the decision of each element depends on no other.
+    A copy is needed if the subject is taller than in training and the images are larger than those of
+    the training, which subjects may fill. Each element is decided independently.
 
     Args:
-        batch: photographs of one size, with or without a border.
-        height: pixels of the subject that the weights know.
+        batch: images of one size, with or without a border.
+        height: the subject's height in training, in pixels.
         patch_size: sides are its multiples, in pixels.
     """
     photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
@@ -226,7 +225,7 @@ def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None
 
 
 def spread_tokens(tokens: Tokens, batch: Batch, patch_size: int) -> Float[Tensor, "b V h w c"]:
-    """Tokens of smaller copies for every patch at full size, bilinear among those that are there.
+    """Tokens of smaller copies for every patch at full size, interpolated bilinearly among existing ones.
 
     Args:
         tokens: of the copies of some elements.
@@ -270,10 +269,10 @@ def _packed(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
 
 
 def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
-    """The batch with smaller photographs, mattes and masks, and their cameras.
+    """The batch with downsampled images, mattes and masks, and their cameras.
 
     Args:
-        batch: photographs without a border; true depths and targets are left out.
+        batch: images without a border; true depths and targets are left out.
         size: height and width of the copies, in pixels.
         least_matte: share of a pixel above which it belongs to the subject, with mattes."""
     images = _resized(at_least_float32(batch.images).flatten(0, 1), size).unflatten(0, batch.masks.shape[:2])
@@ -298,11 +297,11 @@ def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
         size: height and width in pixels.
 
     Returns:
-        Depths in metres, 0 where nothing near is known.
+        Depths in metres, 0 where no valid depth is near.
     """
     depth = at_least_float32(maps.depth)
     inverse = torch.where(maps.valid, 1 / torch.where(maps.valid, depth, 1), 0)
-    # One pixel around what is known: a finger may lie within the photograph's mask and
+    # One pixel around known depths: a finger may lie within the full-size mask and
     # outside the copy's.
     weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
     inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
@@ -316,6 +315,6 @@ def _resized(maps: Float[Tensor, "B c H W"], size: Size) -> Float[Tensor, "B c h
 
 
 def _elements(batch: Batch, chosen: Tensor) -> Batch:
-    """Photographs of some elements, without targets and true depths."""
+    """Input views of some elements, without targets and true depths."""
     alone = dataclasses.replace(batch, targets=None, depths=None, body_vertices=None, subjects=(), views=())
     return map_tensors(alone, lambda values: values[chosen])

@@ -1,4 +1,4 @@
-"""What Gaussians of neighbouring pixels exchange between rounds."""
+"""Feature exchange among Gaussians of neighbouring pixels between rounds."""
 
 import math
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""What differs between cameras: gains, of their exposure or white balance, and gammas. A point on
+"""Photometric differences between cameras: gains (exposure or white balance) and gammas. A point on
 the surface has the same colour in all views that see it, up to a gain of each camera and channel
 (as for panoramas: Brown and Lowe, IJCV 2007)."""
 
@@ -20,7 +20,7 @@ from ghgs_lit.types import Batch, Gaussians
 #: Distance in metres from a view's rendered surface at which a Gaussian's weight in that
 #: view is 1 / e.
 _NEAR = 0.02
-#: Colours closer than this to black or white have less weight: they say little about a gain.
+#: Colours closer than this to black or white have less weight: they constrain a gain little.
 _DARK = 0.05
 #: Deviation of log colours from the gains at which a Gaussian has half its weight: wrong depths,
 #: shadows.
@@ -42,15 +42,15 @@ Real = Bool[Tensor, " N"] | None
 
 
 def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
-    """Gaussians and their photographs, divided by the gains of their cameras.
+    """Gaussians and input views, divided by the gains of their cameras.
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
-        batch: whose photographs are compared.
+        batch: whose images are compared.
         real: which rows are Gaussians; None: all.
 
     Returns:
-        Gaussians with other colours, and the batch with other photographs and its ``log_gains``.
+        Gaussians with other colours, and the batch with corrected images and its ``log_gains``.
     """
     logs = log_gains(gaussians, batch, real)
     colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
@@ -72,13 +72,13 @@ def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
 def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Tensor, "B V 3"]:
     """Natural logarithms of each camera's gains; 0 if views share nothing.
 
-    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views are
+    Their mean is about 0, as images do not determine which camera is right. Pairs of views are
     compared at the Gaussians that both see, with Cauchy weights, so that wrong depths matter little
     (gain compensation; Brown and Lowe, IJCV 2007).
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
-        batch: whose photographs are compared.
+        batch: whose images are compared.
         real: which rows are Gaussians; None: all.
     """
     with exact(gaussians.means.device.type):
@@ -96,7 +96,7 @@ def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Te
 
 @torch.no_grad()
 def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of cameras' gammas beside the median camera's;
+    """Natural logarithms of cameras' gammas relative to the median camera's;
     about 0 if views share nothing.
 
     A gamma is the exponent of a camera's colours. Where those of two views differ, log ratios of
@@ -105,7 +105,7 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
-        batch: whose photographs are compared.
+        batch: whose images are compared.
     """
     with exact(gaussians.means.device.type):
         own, logs, theirs, weights = _compared(gaussians, batch)
@@ -154,11 +154,11 @@ def _compared(
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
-        batch: whose photographs are compared.
+        batch: whose images are compared.
         real: which rows are Gaussians; None: all.
 
     Returns:
-        Number of the own photograph of each, logs of their colours in each view and in their own,
+        Number of each Gaussian's own image, logs of their colours in each view and in their own,
         and weights from 0 to 1.
     """
     depth = render(gaussians, batch.cameras).depth

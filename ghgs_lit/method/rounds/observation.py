@@ -1,4 +1,4 @@
-"""Values of photographs and renders at the positions of Gaussians, without a gradient."""
+"""Values of input views and renders at the positions of Gaussians, without a gradient."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def slopes(
 
     Args:
         gaussians: of the batch.
-        batch: whose photographs and mattes are compared with the renders.
+        batch: whose images and mattes are compared with the renders.
         directions: of the rays of the Gaussians' pixels.
         footprints: size of a pixel at each Gaussian's depth, in the unit of depth.
 
@@ -79,7 +79,7 @@ def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = No
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
-        batch: photographs, masks, mattes and cameras are read.
+        batch: images, masks, mattes and cameras are read.
         rendering: of the Gaussians from these cameras; None: they are rendered.
     """
     with exact(gaussians.means.device.type):
@@ -101,7 +101,7 @@ def looked_up(
         maps: of all views.
 
     Returns:
-        Values in each view, z-depths there, and whether the view can see the means: in its frame,
-        in front.
+        Values in each view, z-depths there, and whether the means are in view: inside the frame and
+        in front of the camera.
     """
     return values_at(gaussians.means, gaussians.image, gaussians.splits, cameras, maps)

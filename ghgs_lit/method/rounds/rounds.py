@@ -1,7 +1,7 @@
-"""Rounds: render the inputs, compare them with the photographs, correct the Gaussians.
+"""Rounds: render the input views, compare renders with images, correct the Gaussians.
 
-A single forward pass never checks its depths and attributes, although the rasterizer draws the
-inputs in milliseconds. In each round every Gaussian is compared with the photographs at its present
+A single forward pass never checks its depths and attributes, although the rasterizer renders the
+inputs in milliseconds. In each round every Gaussian is compared with the images at its present
 position (:mod:`ghgs_lit.method.rounds.observation`), and a small network, the same in all rounds, moves it
 along its ray and changes its raw attributes. Learned optimizers of splats also use the errors of
 re-rendered inputs (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
@@ -95,28 +95,28 @@ Number = Annotated[int, Field(ge=1, le=32)]
 
 
 class RoundsOptions(Options):
-    """Rounds that render the inputs, compare them with the photographs and correct the
+    """Rounds that render the input views, compare renders with images and correct the
     Gaussians."""
 
     group = "rounds"
     count: Number = 2
     """Number of rounds; in prediction any up to 32, where halving has left nothing to change."""
     training_counts: Annotated[tuple[Number, ...], Field(min_length=1)] = (1, 2, 3)
-    """Numbers of rounds, of which each training step draws one, so that any number works."""
+    """Numbers of rounds, of which each training step samples one, so that any number works."""
     hidden: Width = 48
     """Width of the network."""
     depths: int = Field(8, ge=1, le=4096)
-    """Number of depths around the current one at which a round compares the photographs; 4096 are
+    """Number of depths around the current one at which a round compares the images; 4096 are
     finer than their pixels."""
     gains: bool = True
     """Photographs of cameras whose exposure differs are made alike first,
     where a rig does not know them."""
     exchange: Width | None = 16
-    """Channels in which Gaussians of neighbouring pixels tell each other what they know;
-    null: none."""
+    """Feature channels that Gaussians of neighbouring pixels exchange;
+    null: no exchange."""
 
     slopes: bool = False
-    """Whether a round is shown the gradient of the inputs' error with respect to each Gaussian."""
+    """Whether the gradient of the inputs' error with respect to each Gaussian is an input of a round."""
     height: Literal["auto"] | Annotated[int, Field(ge=14, le=16384)] | None = "auto"
     """Pixels of the subject's height, or of its width if larger, that the weights know; auto: four
     fifths of the largest side of the photographs of the training. In larger photographs of taller
@@ -196,7 +196,7 @@ class Rounds(nn.Module):
         Args:
             state: the prediction of the stages, with bounds of depths.
             activate: gives Gaussians from their raw attributes.
-            batch: photographs, masks and cameras are read.
+            batch: images, masks and cameras are read.
             step: size of the first step in depth, in those after a depth head; one for all elements
                 or for each. Attributes take whole steps.
 
@@ -226,10 +226,10 @@ class Rounds(nn.Module):
 
     @contextmanager
     def drawn(self, count: int | None = None) -> Iterator[None]:
-        """Fix the number of rounds of a training step for all that is called inside.
+        """Fixes the number of rounds of a training step within the context.
 
         Args:
-            count: the number; None: the one that is fixed already, or one that is drawn now.
+            count: the number; None: the one already fixed, else a sampled one.
         """
         before = self._known_count
         self._known_count = count or before or self._drawn()
@@ -253,11 +253,11 @@ class Rounds(nn.Module):
         share: float,
         size: float | Float[Tensor, " N"],
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """What a round changes.
+        """Changes of depths and attributes in a round.
 
         Args:
             state: before the round.
-            batch: photographs, masks and cameras are read.
+            batch: images, masks and cameras are read.
             rays: of the Gaussians' pixels.
             memory: of the rounds before.
             windows: places of the Gaussians in maps; None: nothing is exchanged.
@@ -286,7 +286,7 @@ class Rounds(nn.Module):
 
     @property
     def _layers(self) -> tuple[nn.Linear, ...]:
-        """What :func:`ghgs_lit.ops.round_memory.remembered` multiplies with."""
+        """Weights for :func:`ghgs_lit.ops.round_memory.remembered`."""
         return self.view[0], self.view[2], self.update[0], self.update[2], self.memory
 
     @torch.no_grad()
@@ -297,7 +297,7 @@ class Rounds(nn.Module):
 
         Args:
             state: before the round.
-            batch: photographs, masks and cameras are read.
+            batch: images, masks and cameras are read.
             rays: of the Gaussians' pixels.
             reach: largest distance, as a share of the way from near to far; one, or [N].
 
@@ -349,7 +349,7 @@ def _moved(
     Args:
         state: before it.
         activate: gives Gaussians from their raw attributes.
-        batch: photographs, mattes and cameras are read.
+        batch: images, mattes and cameras are read.
         rays: of the Gaussians' pixels, along which they move.
         moved: changes of depths in metres.
         change: of raw attributes.
