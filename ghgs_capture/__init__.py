@@ -1,7 +1,7 @@
-"""A user's own photographs and calibration become files, pages and weights for one's rig.
+"""Turn a user's photographs and calibration into splat files, web pages and weights for their rig.
 
-A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers the verbs for photographs,
-and the instants of a sequence as a data set.
+A plug-in of :mod:`ghgs_lit` through the same entry point as a user's plug-in: it registers the commands
+for photographs, and the instants of a sequence as a data set.
 """
 
 from importlib import import_module
@@ -26,7 +26,7 @@ __all__ = ["Capture", "predict"]
 
 
 def __getattr__(name: str):
-    """Import public names on first use: ``ghgs --help`` must not wait for PyTorch."""
+    """Import public names on first use, so that ``ghgs --help`` does not import PyTorch."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

@@ -1,9 +1,11 @@
-"""Do the masks and cameras of one instant agree? Each mask is tested by leaving its view out, outlines by
-the photographs' edges, cameras by how far rays near outlines miss other silhouettes.
+"""Test whether the masks and cameras of one instant agree.
 
-A grid of points around the subject is looked up in every mask. A pixel can show the subject only
-where its ray passes a point inside the other masks: the hull of the others (visual hull;
-Laurentini, PAMI 1994).
+Each mask is compared with the visual hull of the other masks, each outline with the edges of its photograph,
+and cameras by how far rays near outlines miss the other silhouettes.
+
+The points of a grid around the subject are projected into every mask. A pixel can show the subject only
+if its ray passes a point that lies inside the other masks, which is their visual hull (Laurentini,
+PAMI 1994).
 """
 
 from dataclasses import dataclass
@@ -23,22 +25,22 @@ from ghgs_lit.types import Batch
 _POINTS = 56  #: Points of the grid along each axis
 _LARGER = 1.4  #: Side of the grid, in heights of the subject
 _NOWHERE = -99.0  #: Depth in the others' masks where a ray passes no point
-#: Share of a mask that its hull may lack, and that a mask may take from another's hull,
-#: before it fails.
+#: A mask fails if more than this share of it lies outside the hull of the others, or if it removes
+#: more than this share of another mask from that mask's hull.
 MISSED = 0.01
-CORRECTION = 4  #: Pixels of masks, and rounds of cameras, for correcting what is found
-_REACH = 6  #: Pixels beside an outline in which contrast is measured
-#: Mean pixels of crops from masks' outlines to the photographs', above which masks are off.
+CORRECTION = 4  #: Pixels by which masks, and rounds by which cameras are corrected
+_REACH = 6  #: Pixels on each side of an outline within which contrast is measured
+#: Mean distance, in pixels of the crop, of mask outlines from image edges above which masks are wrong.
 _OFF = 0.35
-#: Mean pixels by which rays near outlines miss other silhouettes, above which cameras are off.
+#: Mean pixels by which rays near outlines miss other silhouettes, above which cameras are wrong.
 _MISSED = 4e-3
-#: The same where the others agree without one camera, or without either of two
+#: The same limit if the other cameras agree without one camera, or without either of two
 _MISSED_BY_FEW = 1.5e-3
-_REST = 0.25  #: Share of the distance that the others have where one camera may be to blame
+_REST = 0.25  #: Share of the distance that remains without a camera, below which that camera may be wrong
 
 
 def reach_of(size: tuple[int, int]) -> int:
-    """Pixels by which outlines of masks, and cameras, may be wrong.
+    """Tolerance in pixels for errors of mask outlines and cameras.
 
     Args:
         size: (height, width) of a photograph in pixels.
@@ -48,25 +50,22 @@ def reach_of(size: tuple[int, int]) -> int:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How deep points of a grid lie in the masks of an instant."""
+    """Signed distances of grid points from the outlines of the masks of one instant."""
 
     photographs: tuple[Photograph, ...]
-    #: [V, n] pixels inside the mask of each view, below 0 outside; beyond a photograph that cuts
-    #: its subject 0, which says nothing
+    #: [V, n] pixels inside the mask of each view, negative outside; 0 (no information) for points
+    #: outside a photograph whose border cuts the subject
     depths: Float[np.ndarray, "V n"]
-    #: [V, n] cell of each point in each view, -1 beyond the photograph
+    #: [V, n] cell of each point in each view, -1 outside the photograph
     cells: Float[np.ndarray, "V n"]
     steps: tuple[int, ...]  #: side of a cell in pixels, by view
 
     @classmethod
     def of(cls, capture: Capture) -> "Agreement | None":
-        """Look up a grid around the subject in all masks.
-
-        Args:
-            capture: of an instant.
+        """Project a grid around the subject into all masks.
 
         Returns:
-            The depths; None where fewer than three views leave nothing to compare.
+            The signed distances; None for fewer than three views, which cannot be compared.
         """
         photographs = capture.photographs
         if len(photographs) < 3:
@@ -89,15 +88,16 @@ class Agreement:
         return cls(photographs, np.stack(depths), np.stack(cells), tuple(steps))
 
     def depth_in_others(self, view: int, without: tuple[int, ...] = (), spare: int = 0) -> np.ndarray:
-        """By how many pixels the best point of each pixel's ray lies inside the other masks.
+        """Compute how far the best point on each pixel's ray lies inside the other masks.
 
         Args:
-            view: whose pixels; its mask is left out.
-            without: further views that are left out.
-            spare: how many of the others a point may miss.
+            view: index of the view whose pixels are tested; its mask is excluded.
+            without: indices of further views to exclude.
+            spare: number of the other masks that a point may lie outside of.
 
         Returns:
-            [h, w] float32; least depth over the others, ``_NOWHERE`` where there is no point.
+            [h, w] float32 in pixels: the least distance over the other masks, ``_NOWHERE`` for rays
+            without a point of the grid.
         """
         others = [v for v in range(len(self.depths)) if v != view and v not in without]
         depths = np.sort(self.depths[others], 0)[spare] if spare else self.depths[others].min(0)
@@ -115,8 +115,8 @@ class Agreement:
         """Share of a mask that lies outside the hull of the others.
 
         Args:
-            view: whose mask.
-            without: views whose masks do not count.
+            view: index of the view whose mask is tested.
+            without: indices of further views whose masks are excluded.
         """
         photograph = self.photographs[view]
         away = self.depth_in_others(view, without) < -reach_of(photograph.mask.shape)
@@ -129,7 +129,7 @@ class Agreement:
 
     @cached_property
     def takes(self) -> tuple[float, ...]:
-        """Most of another mask that lies outside its hull because of each mask, as a share."""
+        """Largest share of another mask that lies outside its hull because of each mask."""
         views = range(len(self.depths))
         taken = []
         for view in views:
@@ -139,13 +139,13 @@ class Agreement:
 
     @property
     def failed(self) -> Bool[np.ndarray, " V"]:
-        """Which masks fail: they are outside the others' hull,
-        or take from it what another needs."""
+        """Masks that lie outside the hull of the others, or that exclude part of another mask from its
+        hull, by more than :data:`MISSED`."""
         return (np.array(self.misses) > MISSED) | (np.array(self.takes) > MISSED)
 
 
 def _middle(photographs: tuple[Photograph, ...]) -> Float[np.ndarray, " 3"]:
-    """The point nearest to the rays through the middles of all masks."""
+    """The point nearest to the rays through the centres of all masks."""
     centers, across = [], []
     for photograph in photographs:
         middle = [(first + end) / 2 for first, end in reversed(photograph.extents)]
@@ -161,19 +161,9 @@ def _middle(photographs: tuple[Photograph, ...]) -> Float[np.ndarray, " 3"]:
 def _looked_up(
     photograph: Photograph, grid: np.ndarray, middle: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depths and cells of a grid's points in one view.
-
-    Args:
-        photograph: of the view.
-        grid: points [n, 3] around the subject's middle, in the user's unit.
-        middle: of the subject [3] in the world.
-        step: side of a cell in pixels.
-
-    Returns:
-        Pixels inside the mask [n] float32, and number of the cell [n].
-    """
+    """Signed distance in pixels [n] float32 and cell index [n] of grid points [n, 3] around ``middle``."""
     rotation = photograph.extrinsics[:3, :3]
-    # in float64: worlds far from their origin
+    # in float64 for worlds far from their origin
     shift = rotation @ middle + photograph.extrinsics[:3, 3]
     lens = photograph.intrinsics
     seen = grid.astype(np.float32) @ (lens @ rotation).T.astype(np.float32) + (lens @ shift).astype(
@@ -193,15 +183,15 @@ def _looked_up(
 
 
 def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
-    """Say where photographs show outlines, if they contradict the masks.
+    """Describe how far image edges lie from the outlines of the masks, if they contradict each other.
 
     Args:
         capture: photographs with their masks.
         size: (height, width) of the crops in pixels.
 
     Returns:
-        Pixels of a crop from each mask's outline inward to the photograph's; "" where masks are
-        right.
+        A message with the distance of each mask's outline from the image edge, in pixels of the crop,
+        positive inward; "" if the masks are right.
     """
     off = [_outline(photograph, size) for photograph in capture.photographs]
     if np.abs(off).mean() <= _OFF:
@@ -210,17 +200,17 @@ def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
 
 
 def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
-    """Say by how much silhouettes miss one another, if cameras are off.
+    """Describe by how much silhouettes miss one another, if cameras are wrong.
 
-    It is also said without which cameras they do not: one, or two that are nearly exchangeable, as
-    opposite ones are.
+    The message also names the cameras without which the others agree: one, or two that are nearly
+    exchangeable, such as opposite ones.
 
     Args:
         capture: photographs with their cameras.
-        batch: its crops, of one element.
+        batch: crops of ``capture``, a batch of one element.
 
     Returns:
-        The message; "" where cameras are right.
+        The message; "" if the cameras are right.
     """
     missed, without = (distances[0].tolist() for distances in contradiction(Frame.of(batch).enter(batch)))
     focal = [photograph.intrinsics[0, 0] for photograph in capture.photographs]
@@ -238,13 +228,13 @@ def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
 
 
 def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
-    """Pixels of the crop inside the mask's outline at which the photograph has the
+    """Distance in pixels of the crop, inward from the mask's outline, at which the photograph has the
     most contrast."""
     extents = photograph.extents
     steps = [(end - start) / (SHARE * side) for (start, end), side in zip(extents, size, strict=True)]
     step = max(*steps, 1)
     reach = (_REACH + 2) * step
-    # One pixel of the photograph for each of the crop: fast, and edges stay where they are.
+    # One pixel of the photograph for each of the crop is fast and keeps the positions of edges.
     lines = [
         np.arange(max(start - reach, 0), min(end - 1 + reach, whole - 1) + 0.5, step).astype(int)
         for (start, end), whole in zip(extents, photograph.mask.shape, strict=True)
@@ -260,8 +250,7 @@ def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
     lines = np.floor(distance[near]).astype(int) + _REACH
     count = np.maximum(np.bincount(lines, minlength=2 * _REACH), 1)
     contrast = np.bincount(lines, np.abs(across).sum(-1), 2 * _REACH) / count
-    # The lines of pixels on either side of an edge, and those beside them,
-    # give fractions of a pixel.
+    # The mean over four lines of pixels around the edge gives fractions of a pixel.
     first = int((contrast[1:-2] + contrast[2:-1]).argmax())
     around = contrast[first : first + 4]
     middle = (around * np.arange(4)).sum() / max(around.sum(), 1e-6)

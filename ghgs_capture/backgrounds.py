@@ -1,10 +1,10 @@
-"""Backgrounds of cameras that stand still, and masks of a sequence that are mended by them.
+"""Estimate backgrounds of static cameras, and correct the masks of a sequence with them.
 
-Such a camera shows the same background in every instant, and at each pixel some instants show it
-without the subject. A mask is tested by leaving its view out (:mod:`ghgs_capture.agreement`); those
-that pass stay as they are. Others are cut anew from what differs from the background, from colours,
-and from the hull of the other masks. Large parts that change are taken over; outlines stay: finding
-them is the work of mattes."""
+A static camera shows the same background in every instant, and at each pixel some instants show it without
+the subject. Each mask is compared with the hull of the other masks (:mod:`ghgs_capture.agreement`); masks
+that pass are kept. The others are segmented again from the difference to the background, from colours, and
+from the hull of the other masks. Only large parts that change are applied; outlines are kept, since they are
+refined with mattes."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -20,27 +20,29 @@ from ghgs_capture.crops import Photograph, shrunk
 from ghgs_capture.minimum_cut import NEIGHBOURS, minimum_cut, neighbour_pairs
 from ghgs_lit.runtime.cores import allowed_cores
 
-#: Instants, spread over a sequence, for its backgrounds: at each pixel several lack the subject.
+#: Instants, spread over a sequence, for its backgrounds; each pixel is free of the subject in several.
 BACKGROUND_INSTANTS = 24
-#: Pixels of the longer side of a subject, about, in which masks are cut: as many as a model sees.
+#: Approximate longer side of the subject, in pixels, at which masks are segmented: that of model inputs.
 _SUBJECT = 256
 _MIN_BACKGROUND = 6  #: Least number of photographs for a background
-#: Levels of 255 by which photographs of a background differ at most.
+#: Largest difference between photographs of a background, in levels of 255.
 _STEADY = 20.0
-#: Least deviation of the noise in levels, and deviations at which a pixel may be of either.
+#: Least standard deviation of the noise in levels, and the number of deviations at which a pixel may
+#: belong to either.
 _NOISE = 2.0
 _DEVIATIONS = 5.0
-#: Shares of area: of the mask, for a large part; of the largest part, below which one is a speck.
+#: Least area of a large part, as a share of the mask's, and of a part that is no speck, as a share of the
+#: largest part's.
 _LARGE = 0.03
 _SPECK = 0.05
-_SHADED = (0.4, 1.0)  #: Share of the light that a shadow leaves
-_BINS = 16  #: Levels of a channel that a histogram of colours counts together
-#: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
+_SHADED = (0.4, 1.0)  #: Range of the share of light that remains in a shadow
+_BINS = 16  #: Bins of a histogram of colours along each channel
+#: Correlation of brightness above which a part shows the background, which distinguishes a grey shirt
+#: from a grey wall.
 _ALIKE = 0.9
-UNLIKE = -1.0  #: Mean odds of colours below which a part is not the subject's
-# Energies of a pixel, in those of a pixel of the background: what the background says at least and
-# at most; what colours do where it is not known; the given mask; a place inside and outside of the
-# others' hull, and outside of two of them.
+UNLIKE = -1.0  #: Mean log odds of colours below which a part is not of the subject
+# Evidence of a pixel for the subject: least and most from the background; most from colours; from the
+# given mask; from a position inside and outside of the others' hull, and outside of two of them.
 _FROM_BACKGROUND = (-4.0, 6.0)
 _FROM_COLORS = 3.0
 _FROM_MASK = 1.0
@@ -48,11 +50,11 @@ _IN_HULL = 1.0
 _OUT_OF_HULL = 2.0
 _OUT_OF_TWO = 4.0
 #: Cost of different labels of neighbours of one colour, and the share of it that remains at an edge
-#: of several times ``_CONTRAST`` levels.
+#: with a contrast of several times ``_CONTRAST`` levels.
 _TOGETHER = 6.0
 _AT_EDGE = 0.1
 _CONTRAST = 10.0
-_ROUNDS = 3  #: Masks mended in one round are the others' hulls in the next
+_ROUNDS = 3  #: Masks corrected in one round define the hulls of the next
 
 
 @dataclass(frozen=True)
@@ -61,24 +63,24 @@ class Background:
 
     image: np.ndarray  #: [h, w, 3] float32, levels from 0 to 255
     known: np.ndarray  #: [h, w] bool
-    odds: np.ndarray  #: [bins, bins, bins] log of how much likelier a colour is the subject's
+    odds: np.ndarray  #: [bins, bins, bins] log odds that a colour is of the subject
 
     @classmethod
     def of(
         cls, photographs: Sequence[Photograph], covered: Sequence[np.ndarray], trusted: Sequence[Photograph]
     ) -> "Background":
-        """The background that photographs of one camera share.
+        """Estimate the background that photographs of one camera share.
 
-        At each pixel it is the mean of a quarter of them (at least three), those that agree best.
+        Each pixel is the mean over the quarter of the photographs (at least three) that agree best.
 
         Args:
             photographs: three or more of one camera, of one size.
-            covered: where each may show the subject [h, w].
-            trusted: photographs of the camera whose masks tell the subject's colours.
+            covered: [h, w] bool for each photograph, true where it may show the subject.
+            trusted: photographs of the camera whose masks define the subject's colours.
 
         Returns:
-            The background; known where enough photographs show it without the subject and differ by
-            less than ``_STEADY`` levels.
+            The background; ``known`` where enough photographs show it without the subject and differ
+            by less than ``_STEADY`` levels.
         """
         images = np.stack([photograph.image for photograph in photographs])
         count = max(3, len(images) // 4)
@@ -101,21 +103,21 @@ class Background:
     def mended(
         self, photograph: Photograph, inside: np.ndarray | None = None, most: np.ndarray | None = None
     ) -> Photograph:
-        """Cut the mask of a photograph anew.
+        """Segment a photograph again.
 
         Args:
             photograph: of this camera, of the background's size.
-            inside: pixels by which each pixel lies inside the hull of the other masks [h, w]; None:
-                there are no others.
-            most: the same of the others but one.
+            inside: [h, w] distance in pixels of each pixel inside the hull of the other masks; None
+                without other masks.
+            most: as ``inside``, for the hull in which one of the other masks may be missed.
 
         Returns:
-            The photograph with a corrected mask; itself where no large part changes.
+            The photograph with a corrected mask; the given one if no large part changes.
         """
         reach = reach_of(self.known.shape)
         there = photograph.mask if most is None else photograph.mask | (most > -reach)
         spans = [np.nonzero(there.any(axis))[0][[0, -1]] for axis in (1, 0)]
-        margin = (24 if most is None else 8) * reach  # without hulls, parts are looked for nearby
+        margin = (24 if most is None else 8) * reach  # without hulls, missing parts are sought near the mask
         box = tuple(slice(max(first - margin, 0), last + margin) for first, last in spans)
         evidence = self._evidence(photograph, box)
         hull = None
@@ -134,7 +136,7 @@ class Background:
         return replace(photograph, matte=matte)
 
     def _evidence(self, photograph: Photograph, box: tuple[slice, slice]) -> np.ndarray:
-        """What background, colours and mask say about each pixel of a box; above 0: the subject."""
+        """Evidence of background, colours and mask for each pixel of a box; positive for the subject."""
         image, behind, known = photograph.image[box], self.image[box], self.known[box]
         mask = photograph.mask[box]
         off = np.abs(image - behind).max(-1)
@@ -150,12 +152,11 @@ class Background:
         return evidence + np.where(mask, _FROM_MASK, -_FROM_MASK)
 
     def odds_of(self, image: np.ndarray) -> np.ndarray:
-        """:attr:`odds` of the colours of pixels [..., 3] uint8."""
+        """Look up :attr:`odds` for the colours of pixels [..., 3] uint8."""
         return self.odds[tuple(np.moveaxis(image // (256 // _BINS), -1, 0))]
 
     def _costs(self, photograph: Photograph, box: tuple[slice, slice]) -> list[np.ndarray]:
-        """Costs of pairs of neighbours, less where the photograph has an edge that the
-        background lacks."""
+        """Costs of pairs of neighbours, lower at edges of the photograph that the background lacks."""
         image, behind, known = photograph.image[box], self.image[box], self.known[box]
         costs = []
         for step in NEIGHBOURS:
@@ -171,17 +172,7 @@ class Background:
     def _changed(
         self, photograph: Photograph, cut: np.ndarray, box: tuple[slice, slice], hull: np.ndarray | None
     ) -> np.ndarray | None:
-        """Take over large parts of a new mask.
-
-        Args:
-            photograph: with the mask so far.
-            cut: the new mask of a box [h, w].
-            box: rows and columns of it.
-            hull: pixels by which each lies inside the hull of the others; None: not known.
-
-        Returns:
-            The box's matte [h, w] uint8; None: no large part changes.
-        """
+        """The matte [h, w] uint8 of a box with the large changes of the mask ``cut``; None without any."""
         image, behind, known = photograph.image[box], self.image[box], self.known[box]
         matte = photograph.matte[box]
         mask = matte > 127
@@ -196,7 +187,7 @@ class Background:
         come = _large(cut & ~mask, mask, reach)
         if not gone.any() and not come.any():
             return None
-        # Rims of parts that change belong to them.
+        # Parts that change include their rims, which the opening removed.
         gone = ndimage.binary_dilation(gone, iterations=reach, mask=mask & ~cut)
         come = ndimage.binary_dilation(come, iterations=reach, mask=cut & ~mask)
         matte = np.where(come, np.uint8(255), np.where(gone, np.uint8(0), matte))
@@ -207,7 +198,7 @@ class Background:
 
 
 def _without_specks(matte: np.ndarray) -> np.ndarray:
-    """A matte [h, w] uint8 without parts that are much smaller than the largest."""
+    """Remove parts of a matte [h, w] uint8 that are much smaller than the largest."""
     labels, count = ndimage.label(matte > 127)
     areas = np.bincount(labels.ravel(), minlength=count + 1)
     areas[0] = areas[1:].max(initial=0)
@@ -230,13 +221,13 @@ def _is_alike(image: np.ndarray, behind: np.ndarray) -> bool:
 
 
 def _parts(parts: np.ndarray, keep: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """The connected parts for which ``keep``, called with the mask of one part, says true."""
+    """Select the connected parts for which ``keep``, called with the mask of one part, returns true."""
     labels, count = ndimage.label(parts)
     return np.isin(labels, [number for number in range(1, count + 1) if keep(labels == number)])
 
 
 def _large(parts: np.ndarray, mask: np.ndarray, reach: int) -> np.ndarray:
-    """The parts that are thick and have ``_LARGE`` of the mask's area."""
+    """Select parts that survive an opening and cover at least the share ``_LARGE`` of the mask's area."""
     labels, count = ndimage.label(ndimage.binary_opening(parts, iterations=reach))
     areas = np.bincount(labels.ravel(), minlength=count + 1)
     areas[0] = 0
@@ -245,10 +236,10 @@ def _large(parts: np.ndarray, mask: np.ndarray, reach: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """The backgrounds of a rig that stands still, by camera."""
+    """The backgrounds of a static rig, by camera."""
 
     cameras: Mapping[str, Background]
-    #: Pixels of photographs along a side of one of the backgrounds
+    #: Pixels of a photograph along the side of one pixel of the background, by camera
     factors: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
@@ -256,11 +247,10 @@ class Backgrounds:
         """Estimate backgrounds from instants that are spread over a sequence.
 
         Args:
-            captures: the instants, of cameras that stand still.
+            captures: the instants, of static cameras.
 
         Returns:
-            The backgrounds of cameras with ``_MIN_BACKGROUND`` photographs or more,
-            all of one size.
+            The backgrounds of cameras with at least ``_MIN_BACKGROUND`` photographs, all of one size.
         """
         extents: dict[str, list[int]] = {}
         for photograph in itertools.chain.from_iterable(capture.photographs for capture in captures):
@@ -286,14 +276,14 @@ class Backgrounds:
         return cls(cameras, factors)
 
     def applied(self, capture: Capture) -> Capture:
-        """Mend the masks that fail, where that lets all masks agree better.
+        """Correct the masks that fail, if all masks agree better afterwards.
 
         Args:
             capture: an instant; cameras without a background of their photograph's size keep their
                 masks.
 
         Returns:
-            The capture with corrected masks; photographs whose masks are right are those given.
+            The capture with corrected masks; photographs with right masks are returned unchanged.
         """
         if not self.cameras:
             return capture
@@ -316,7 +306,7 @@ class Backgrounds:
         return replace(capture, photographs=tuple(photographs))
 
     def _mended(self, capture: Capture, agreement: Agreement | None) -> Capture:
-        """One round over the masks of an instant that fail."""
+        """Correct the failed masks of an instant once."""
 
         def mended(view: int) -> Photograph:
             photograph = capture.photographs[view]
@@ -333,7 +323,7 @@ class Backgrounds:
             return replace(capture, photographs=tuple(pool.map(mended, range(len(capture.photographs)))))
 
     def _taken_over(self, photograph: Photograph, given: Photograph, mended: Photograph) -> Photograph:
-        """A photograph with what changed in its smaller one; itself where nothing did."""
+        """Apply the changes of a downsampled mask to its photograph."""
         if mended is given:
             return photograph
         factor = self.factors[photograph.name]
@@ -346,7 +336,7 @@ class Backgrounds:
 
 
 def _covered(photograph: Photograph, view: int, agreement: Agreement | None) -> np.ndarray:
-    """Where a photograph may show the subject [h, w], also where its mask lacks a part."""
+    """Pixels [h, w] that may show the subject, including parts that its mask lacks."""
     reach = reach_of(photograph.mask.shape)
     covered = ndimage.binary_dilation(photograph.mask, iterations=reach)
     if agreement is not None and agreement.takes[view] > MISSED:

@@ -1,7 +1,7 @@
-"""Calibrations as files store them, and their meaning in the conventions of :mod:`ghgs_lit.types`.
+"""Convert calibrations from the conventions of files to those of :mod:`ghgs_lit.types`.
 
-Few files say whether poses map the world to the camera, and with which axes: the format tells,
-or the user.
+Few files state whether poses map the world to the camera, and with which axes. The format or the user
+defines it.
 """
 
 import math
@@ -20,11 +20,11 @@ EXTRINSICS = ("world_to_camera", "camera_to_world")
 AXES = ("opencv", "opengl")
 INTRINSICS = ("pixels", "normalized", "normalized_principal")
 
-#: Largest gain of a camera's colours relative to the mean of all; the least is its inverse.
+#: Largest gain of a camera's colours relative to the mean of all cameras; the least is its inverse.
 MOST_GAIN = 2.0
-#: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
+#: Converts between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
+# Video is coded in blocks of 16 pixels, so some programs crop a sensor's 1088 rows to 1080.
 _CODED = 1088
 _SHOWN = 1080
 # Distance from the origin beyond which a rotation's seventh digit moves a centre by
@@ -45,9 +45,10 @@ class Convention:
             ``normalized_principal`` (the principal point alone).
         pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0
             (``integer``, as OpenCV's).
-        resized: factor of a resize after the calibration, beyond the sizes that the file says.
+        resized: factor of a resize after the calibration, in addition to sizes stored in the file.
         unit: metres of one unit of length.
-        exif: which pixels of a turned photograph it is for: ``auto`` | ``stored`` | ``shown``."""
+        exif: whether the calibration is for the pixels as stored or with the EXIF rotation applied:
+            ``auto`` | ``stored`` | ``shown``."""
 
     extrinsics: str = "world_to_camera"
     axes: str = "opencv"
@@ -63,13 +64,10 @@ class Convention:
             require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
 
     def with_options(self, options: Mapping[str, Any]) -> "Convention":
-        """Replace what the user says of the convention.
+        """Override attributes of the convention with the user's values.
 
         Args:
-            options: values by the names of :class:`Convention`; None and other keys are ignored.
-
-        Returns:
-            The convention with these values.
+            options: values by attribute name; None and other keys are ignored.
 
         Raises:
             InputError: ``resized`` or ``unit`` is out of range.
@@ -80,22 +78,22 @@ class Convention:
 
 @dataclass(frozen=True)
 class PartialIntrinsics:
-    """What a file says of intrinsics that depend on the photograph's size, for x and y;
-    None: nothing."""
+    """Intrinsics that depend on the photograph's size, for x and y; None for values that the file lacks."""
 
     focal: tuple[float | None, float | None]  #: in pixels
-    #: principal point in pixels; None: the photograph's middle
+    #: principal point in pixels; None: the photograph's centre
     middle: tuple[float | None, float | None]
-    angles: tuple[float | None, float | None]  #: of view in radians, where there is no focal length
+    angles: tuple[float | None, float | None]  #: angles of view in radians, used if there is no focal length
 
     @property
     def is_known(self) -> bool:
-        """Whether the intrinsics are the same for every size."""
+        """Whether the intrinsics do not depend on the photograph's size."""
         return self.focal != (None, None) and None not in self.middle
 
     def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
-        """Complete the intrinsics for one photograph;
-        pixels are square where the file has one focal length.
+        """Complete the intrinsics for one photograph.
+
+        Pixels are square if the file has a single focal length.
 
         Args:
             size: (height, width) of the photograph in pixels.
@@ -121,13 +119,13 @@ class StoredCamera:
         origin: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
-        size: (height, width) in pixels of the calibrated images, where the file says it.
+        size: (height, width) in pixels of the calibrated images; None if the file lacks it.
         distortion: 0 to 14 numbers: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
             ``fisheye`` k1 to k4 of Kannala and Brandt's model.
-        mask: the photograph's mask, where the file names it.
-        gains: [3], of red, green and blue relative to other cameras, where the file says them.
-        lens: in place of ``intrinsics`` where they depend on the photograph's size and the
-            file has none.
+        mask: path of the photograph's mask; None if the file lacks it.
+        gains: [3], of red, green and blue relative to other cameras; None if the file lacks them.
+        lens: replaces ``intrinsics`` if they depend on the photograph's size and the file has no
+            size.
         unread: keys of the camera in the file that are not read."""
 
     name: str
@@ -143,22 +141,18 @@ class StoredCamera:
     unread: tuple[str, ...] = ()
 
     def has_numbers_of(self, other: "StoredCamera") -> bool:
-        """Whether both cameras have the same intrinsics, pose, distortion and size.
-
-        Args:
-            other: camera of the same file.
-        """
+        """Whether both cameras of a file have the same intrinsics, pose, distortion and size."""
         both = ((c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other))
         return self.lens == other.lens and all(map(np.array_equal, *both))
 
     def sized(self, photograph: tuple[int, int]) -> "StoredCamera":
-        """Give the camera a size, and the intrinsics that depend on it.
+        """Set the camera's size and the intrinsics that depend on it.
 
         Args:
             photograph: (height, width) in pixels, for a camera whose file has no size.
 
         Returns:
-            The camera with a size; itself where the file has one.
+            The camera with a size; unchanged if the file has one.
         """
         if self.size is not None:
             return self
@@ -189,7 +183,7 @@ class Calibration:
 
     intrinsics: np.ndarray  #: [3, 3] float64 in pixels, pixel centres at +0.5
     extrinsics: np.ndarray  #: [4, 4] float64, world to camera, OpenCV axes
-    distortion: np.ndarray  #: this and what follows: as for :class:`StoredCamera`
+    distortion: np.ndarray  #: this and the following attributes: as for :class:`StoredCamera`
     fisheye: bool
     gains: np.ndarray | None = None
 
@@ -208,7 +202,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
         The camera, with its distortion, for photographs of this size.
 
     Raises:
-        InputError: the photograph's aspect ratio is not that of the calibration.
+        InputError: the photograph's aspect ratio differs from the calibration's.
     """
     camera = camera.sized(photograph)
     size = camera.size
@@ -237,12 +231,12 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
 def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
     """Convert a stored pose.
 
-    Far from the origin (``_FAR``) the rotation becomes the nearest orthogonal one; the camera's
-    centre stays.
+    Beyond a distance of ``_FAR`` from the origin, the rotation is replaced by the nearest orthogonal one,
+    which keeps the camera's centre.
 
     Args:
-        pose: [4, 4], as the file has it.
-        convention: what the pose maps, the camera's axes, and the unit of length.
+        pose: [4, 4], as stored in the file.
+        convention: the direction of the pose, the camera's axes, and the unit of length.
 
     Returns:
         World to camera [4, 4] with OpenCV axes, in the convention's unit.
@@ -255,9 +249,8 @@ def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:
-    """The pose with the nearest rotation and the same camera centre: a rotation of seven digits
-    is not orthogonal enough, and 100 km from the origin the transpose puts the centre a
-    centimetre off."""
+    """Replace a rotation of seven digits by the nearest orthogonal one, without which the transpose moves
+    a camera centre 100 km from the origin by a centimetre."""
     u, _, v = np.linalg.svd(pose[:3, :3])
     rigid = pose.copy()
     rigid[:3, :3] = u @ v
@@ -266,7 +259,7 @@ def _rigid(pose: np.ndarray) -> np.ndarray:
 
 
 def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size is the other one scaled, up to rounding to whole pixels (``_ROUNDING``).
+    """Whether two sizes have the same aspect ratio, up to rounding to whole pixels (``_ROUNDING``).
 
     Args:
         one: (height, width) in pixels.
@@ -276,16 +269,15 @@ def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
-    """Turn a camera with its photograph.
+    """Rotate a camera together with its photograph by quarter turns.
 
     Args:
-        calibration: the camera before, without distortion.
-        turns: quarter turns of the photograph counterclockwise, as of ``numpy.rot90``; any whole
-            number.
-        size: (height, width) of the photograph before, in pixels.
+        calibration: the camera before the rotation, without distortion.
+        turns: quarter turns of the photograph counterclockwise, as for ``numpy.rot90``; any integer.
+        size: (height, width) of the photograph before the rotation, in pixels.
 
     Returns:
-        The camera of the turned photograph.
+        The camera of the rotated photograph.
     """
     for _ in range(turns % 4):
         k = calibration.intrinsics

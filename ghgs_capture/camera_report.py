@@ -1,6 +1,5 @@
-"""Report on the cameras of a capture: how far masks and cameras agree
-(:mod:`ghgs_lit.geometry.silhouettes`), and which other meaning of the calibration's numbers
-(:class:`Hypothesis`) makes them agree."""
+"""Report how well the masks and cameras of a capture agree (:mod:`ghgs_lit.geometry.silhouettes`), and
+which other interpretation of the calibration (:class:`Hypothesis`) makes them agree."""
 
 import itertools
 import math
@@ -18,11 +17,11 @@ from ghgs_lit.data.view import area_image, area_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
-#: Least agreement of every view of a right calibration, and by how much a better meaning must win.
+#: Least agreement of every view of a right calibration, and least gain of a better interpretation
 AGREES = 0.9
 BETTER = 0.05
-#: Agreement below which a view is sought that disagrees,
-#: and how much of the disagreement it may leave.
+#: Agreement below which disagreeing views are sought, and the largest share of the disagreement that may
+#: remain without them
 _SOUND = 0.97
 _REST = 1 / 3
 _SAME = 0.01  # Insignificant difference of agreement
@@ -32,35 +31,35 @@ _MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point i
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 PERSON = (0.5, 2.5)  #: A person's largest extent in metres
 _UNITS = {"metres": 1.0, "millimetres": 0.001, "centimetres": 0.01, "kilometres": 1000.0}
-# A part of a mask is another person where it has this share of the largest part's area, or more.
+# Least area, as a share of the largest part's, of a part of a mask that counts as another person
 _PART = 1 / 3
-# Two copies of a photograph, stored with losses: least common share of their masks, and mean
-# difference of levels of 255 within them.
+# Copies of a photograph stored with losses: least overlap of their masks, and largest mean difference
+# within them in levels of 255
 _SAME_MASK = 0.98
 _SAME_LEVELS = 2.0
 
 
 @dataclass(frozen=True)
 class StoredView:
-    """One photograph at a small size, its camera as stored, and what the camera's numbers mean."""
+    """One downsampled photograph, its camera as stored, and the convention of the camera's numbers."""
 
     name: str
     camera: StoredCamera
     pixels: Pixels
     mask: np.ndarray
     convention: Convention
-    turned: StoredCamera  #: the camera, where the photograph's EXIF turn is read the other way
+    turned: StoredCamera  #: the camera with the other reading of the photograph's EXIF rotation
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A meaning of a calibration, and how well masks and cameras agree with it."""
+    """An interpretation of a calibration, and how well masks and cameras agree under it."""
 
     meaning: str
-    option: str  #: of the command line, for this meaning; empty: none
+    option: str  #: command-line option for this interpretation; empty: none
     views: tuple[StoredView, ...]
-    blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
-    #: of each mask, in the hull of the others; all 0 where no camera can have this meaning
+    blames: tuple[str, ...] = ()  #: the cameras that it considers wrong; empty: all, or none
+    #: share of each mask in the hull of the others; all 0 if no camera can have this interpretation
     shares: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -69,10 +68,10 @@ class Hypothesis:
         return min(self.shares.values())
 
     def photographs(self, folder: CaptureFolder) -> list[Photograph]:
-        """The small photographs, upright and without lens distortion, with cameras of this meaning.
+        """The downsampled photographs, upright and undistorted, with cameras of this interpretation.
 
         Args:
-            folder: where the views come from.
+            folder: the folder that the views were read from.
 
         Raises:
             InputError: a photograph has another aspect ratio than its calibration.
@@ -86,7 +85,7 @@ class Hypothesis:
         """Measure the :attr:`shares`.
 
         Args:
-            folder: where the views come from.
+            folder: the folder that the views were read from.
         """
         try:
             shares = HullSearch().shares(_make_silhouettes(self.photographs(folder)))
@@ -101,23 +100,23 @@ class Diagnosis:
 
     consistent: bool
     lines: tuple[str, ...]
-    best: Hypothesis  #: of all meanings that were tried
-    #: views that disagree with the others; a few may also if consistent
+    best: Hypothesis  #: of all interpretations that were tried
+    #: views that disagree with the others; possibly not empty if consistent
     suspects: tuple[str, ...] = ()
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     """Examine the cameras of one instant.
 
-    Copies are looked for first, then other meanings of all cameras, then mistakes of one or two of
-    them.
+    Tests for copies first, then other interpretations of all cameras, then mistakes of one or two cameras
+    and cyclic exchanges of all.
 
     Args:
         folder: photographs, masks and calibration.
         instant: one of ``folder.instants``; None: the first.
 
     Returns:
-        Whether cameras and masks agree, with what was found.
+        Whether cameras and masks agree, with the findings.
 
     Raises:
         InputError: a file cannot be read.
@@ -140,7 +139,7 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     if best.score <= given.score + BETTER:
         base = given
     if best.score < AGREES:
-        # A single wrong camera is sought with the best meaning for all.
+        # A single wrong camera is sought under the best interpretation for all cameras.
         tried += [hypothesis.scored(folder) for hypothesis in _correct_some(base.views)]
         best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < max(AGREES, given.score + BETTER):
@@ -152,14 +151,14 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
 
 
 def read_small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
-    """Decode the photographs of an instant, so small that many meanings can be tried.
+    """Decode the photographs of an instant at a small size, so that many interpretations can be tried.
 
     Args:
         folder: photographs, masks and calibration.
         instant: one of ``folder.instants``.
 
     Returns:
-        A view for each photograph, of at most ``_SIDE`` pixels a side.
+        A view for each photograph, with sides of at most ``_SIDE`` pixels.
 
     Raises:
         InputError: a file cannot be read.
@@ -169,7 +168,7 @@ def read_small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, .
         height, width = pixels.size
         scale = min(_SIDE / max(height, width), 1)
         size = max(round(height * scale), 1), max(round(width * scale), 1)
-        # Without a stored size the intrinsics are for the whole photograph.
+        # Without a stored size, the intrinsics are for the whole photograph.
         sizes = pixels.size, pixels.stored_size
         keeps_stored = fits_stored(pixels, camera, folder.convention.exif)
         read = camera.sized(sizes[keeps_stored])
@@ -181,7 +180,7 @@ def read_small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, .
 
 
 def find_parted_masks(views: Sequence[StoredView]) -> list[str]:
-    """Find masks that have a second large part, as two people have.
+    """Find masks that have a second large part, such as another person.
 
     Args:
         views: the photographs with their masks.
@@ -189,7 +188,7 @@ def find_parted_masks(views: Sequence[StoredView]) -> list[str]:
     Returns:
         The names of these photographs.
     """
-    from scipy import ndimage  # here: it takes time to import
+    from scipy import ndimage  # imported here because the import is slow
 
     names = []
     for view in views:
@@ -201,13 +200,13 @@ def find_parted_masks(views: Sequence[StoredView]) -> list[str]:
 
 
 def find_copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
-    """Find two photographs that are the same picture, also if stored with losses.
+    """Find two photographs that are copies of one picture, even if stored with losses.
 
     Args:
         photographs: of one instant, with their mattes.
 
     Returns:
-        Their names; None: there are none.
+        Their names; None without copies.
     """
     for one, other in itertools.combinations(photographs, 2):
         if one.image.shape != other.image.shape:
@@ -225,7 +224,7 @@ def _make_silhouettes(photographs: Sequence[Photograph]) -> list[Silhouette]:
 
 
 def _describe_size(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
-    """The subject's largest extent in the user's unit, and the option that makes it metres."""
+    """Describe the subject's largest extent in the user's unit, and the option that converts it to metres."""
     silhouettes = _make_silhouettes(hypothesis.photographs(folder))
     focus, _ = subject_sphere(silhouettes)
     size = float(np.median([silhouette.extent(focus).max() for silhouette in silhouettes]))
@@ -237,10 +236,10 @@ def _describe_size(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
 
 
 def _find_suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple[str, ...], str]:
-    """The views that explain by themselves most of the disagreement, and a line about it.
+    """Views each of which explains most of the disagreement, and a line about it.
 
-    A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it:
-    what is compared are the others with and without it."""
+    A mask that lacks a part lies in the hull of the others but removes parts of them from their hulls, so
+    the agreement of the others is compared with and without it."""
     least = max(AGREES, 1 - (1 - hypothesis.score) * _REST)
     fitting = {}
     for left_out in hypothesis.views if len(hypothesis.views) > 2 else ():
@@ -249,7 +248,7 @@ def _find_suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple
         if score >= least:
             fitting[left_out.name] = score
     readings = {name: _describe_fault(hypothesis, name) for name in fitting}
-    if len(hypothesis.views) == 3 and any(readings.values()):  # two views alone agree nearly always
+    if len(hypothesis.views) == 3 and any(readings.values()):  # two views nearly always agree
         fitting = {name: score for name, score in fitting.items() if readings[name]}
     if not fitting:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in hypothesis.shares.items())
@@ -264,8 +263,7 @@ def _find_suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple
 
 
 def _describe_fault(hypothesis: Hypothesis, name: str) -> str:
-    """What may be wrong with a view, by whether its own mask or those of the others lie
-    outside a hull."""
+    """Describe the likely fault of a view by whether its mask or another one lies outside its hull."""
     own = 1 - hypothesis.shares[name]
     others = 1 - min(share for other, share in hypothesis.shares.items() if other != name)
     if own <= _REST * others:
@@ -276,8 +274,7 @@ def _describe_fault(hypothesis: Hypothesis, name: str) -> str:
 
 
 def _reinterpret_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Other meanings of all cameras: what poses map, axes, unit of the intrinsics, a resize, and
-    EXIF turns."""
+    """Vary the direction of poses, axes, unit of the intrinsics, resize and EXIF rotation of all cameras."""
     given = views[0].convention
     readings = [views]
     if any(view.pixels.turns for view in views):
@@ -285,7 +282,7 @@ def _reinterpret_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
         turned = (replace(view, camera=view.turned, convention=convention) for view in views)
         readings.append(tuple(turned))
     points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
-    scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
+    scale = 0.5 / max(float(np.median(points)), 0.01)  # moves principal points to the centre
     likely = min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
     meanings = itertools.product(readings, INTRINSICS, (given.resized, likely), EXTRINSICS, AXES)
     for read, intrinsics, resized, extrinsics, axes in meanings:
@@ -303,8 +300,7 @@ def _reinterpret_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
 
 
 def _is_plausible(view: StoredView) -> bool:
-    """Whether the principal point of a view lies in the middle part of its photograph
-    (``_MIDDLE``)."""
+    """Whether the principal point of a view lies in the central part (``_MIDDLE``) of its photograph."""
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]
@@ -312,7 +308,7 @@ def _is_plausible(view: StoredView) -> bool:
 
 
 def _correct_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Mistakes of one camera, and cameras or masks that are exchanged, which look alike to the hull."""
+    """Correct one camera, or exchange cameras or masks, which the hull cannot distinguish."""
     for i, view in enumerate(views):
         for mistake, changed in _correct_one(view):
             mended = (*views[:i], changed, *views[i + 1 :])
@@ -338,7 +334,7 @@ def _correct_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
 
 
 def _fit_better(pairs: Sequence[tuple[StoredView, StoredView]]) -> bool:
-    """Whether outlines of the masks follow edges of the other photographs rather than of their own."""
+    """Whether the masks' outlines follow edges of the other photographs better than of their own."""
     if any(view.mask.shape != other.mask.shape for view, other in pairs):
         return False
     own = math.prod(_measure_contrast(view, view.mask) for view, _ in pairs)
@@ -346,14 +342,14 @@ def _fit_better(pairs: Sequence[tuple[StoredView, StoredView]]) -> bool:
 
 
 def _measure_contrast(view: StoredView, mask: np.ndarray) -> float:
-    """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
+    """Mean gradient of the photograph along a mask's outline, which is largest for the right mask."""
     outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
     gradient = np.hypot(*np.gradient(view.pixels.image.mean(-1)))
     return float(gradient[outline].mean()) if outline.any() else 0.0
 
 
 def _correct_one(view: StoredView) -> Iterator[tuple[str, StoredView]]:
-    """Usual mistakes of a single camera in words, each with the view after mending it."""
+    """Describe usual mistakes of a single camera, each with the corrected view."""
     given = view.convention
     for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
         convention = replace(given, extrinsics=extrinsics, axes=axes)

@@ -1,4 +1,4 @@
-"""A user's photographs of one instant, and the batch that a model sees of them."""
+"""A user's photographs of one instant, and their conversion to a model's input batch."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ class Capture:
 
     @classmethod
     def read(cls, images: str | Path, cameras: str | Path, **options: Any) -> "Capture":
-        """Read a folder with photographs of one instant, and their cameras.
+        """Read the photographs and cameras of one instant.
 
         Args:
             images: the folder; photographs are named after their cameras.
@@ -42,16 +42,16 @@ class Capture:
         return cls(instants[0], folder.photographs(instants[0]))
 
     def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
-        """Crops around the subject on a black background, as a model sees them.
+        """Crop the photographs around the subject, on a black background, as input of a model.
 
-        Cameras are in the user's world, in float64, which a world far from its origin needs.
-        Photographs are divided by the gains of their cameras where those of all are known.
+        Cameras stay in the user's world, in float64 for worlds far from their origin. Photographs are
+        divided by the gains of their cameras if the gains of all cameras are known.
 
         Args:
             size: (height, width) of the crops in pixels.
             refine_masks: pixels of a crop by which outlines of masks may be wrong; mattes are then
-                searched in the photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks
-                are right.
+                estimated from the photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks
+                are used unchanged.
 
         Returns:
             A batch of one element; images from 0 to 1.

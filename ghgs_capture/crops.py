@@ -1,4 +1,4 @@
-"""One photograph of a capture, and the crop of it that a model sees."""
+"""One photograph of a capture, and its crop for a model's input."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -7,9 +7,9 @@ import numpy as np
 
 from ghgs_lit.data.view import area_image
 
-#: Share of a crop's height or width that the subject takes, as in training photographs.
+#: Share of a crop's height or width that the subject fills, as in training images
 SHARE = 0.8
-_FINER = 2  #: Largest size of photographs for refined mattes, relative to crops
+_FINER = 2  #: Largest size at which mattes are refined, relative to the crop's
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,20 @@ class Photograph:
 
     @property
     def extents(self) -> list[tuple[int, int]]:
-        """The first row and the one after the last of the subject, then its columns."""
+        """(first, end) rows, then columns of the subject; ``end`` is exclusive."""
         lines = (np.nonzero(self.mask.any(axis))[0] for axis in (1, 0))
         return [(int(occupied[0]), int(occupied[-1]) + 1) for occupied in lines]
 
 
 def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:
-    """Cut the subject out, in the middle of the crop, and move its camera along.
+    """Crop a photograph so that the subject is in the centre, and adapt its camera.
 
-    Beyond the photograph and beside the subject the crop is black. A large photograph's sharp mask
-    becomes a soft matte. Where the photograph's border cuts the subject the crop ends, too: black
-    beside it would look like the subject's end.
+    The crop is black outside of the photograph and of the subject. A large photograph's sharp mask becomes
+    a soft matte. If the photograph's border cuts the subject, the crop ends at that border, since black
+    pixels next to it would look like the subject's boundary.
 
     Args:
-        photograph: with a subject of one pixel or more.
+        photograph: shows the subject in at least one pixel.
         size: (height, width) of the crop in pixels.
         refine_masks: as for :meth:`ghgs_capture.capture.Capture.batch`.
 
@@ -63,7 +63,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     intrinsics[:2] *= factors[:, None]
     image = _cut(photograph.image, spans)
     matte = _cut(photograph.matte, spans)
-    # Before resizing, so that the rim has nothing of the background.
+    # Before resizing, so that the background does not bleed into the rim.
     if refine_masks:
         image, matte = _refined(photograph.name, image, matte, size, refine_masks)
     else:
@@ -74,15 +74,14 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
 
 
 def shrunk(photograph: Photograph, factor: int) -> Photograph:
-    """A photograph of fewer pixels, each the mean of some.
+    """Downsample a photograph by averaging blocks of pixels.
 
     Args:
-        photograph: of ``factor`` pixels a side or more.
-        factor: pixels of the photograph along a side of each new one; what is left over at its
-            right and its bottom is cut off.
+        photograph: with sides of at least ``factor`` pixels.
+        factor: side of a block in pixels; incomplete blocks at the right and the bottom are cropped.
 
     Returns:
-        The smaller photograph with its camera.
+        The downsampled photograph with its camera.
     """
     if factor == 1:
         return photograph
@@ -97,20 +96,9 @@ def shrunk(photograph: Photograph, factor: int) -> Photograph:
 def _refined(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the matte of a cut, which is resized first where it is much larger than the crop.
-
-    Args:
-        name: of the photograph, for a warning.
-        image: the cut [h, w, 3] uint8.
-        matte: its matte [h, w] uint8.
-        size: (height, width) of the crop in pixels.
-        pixels: of the crop, by which the mask's outline may be wrong.
-
-    Returns:
-        The subject on black [h, w, 3] and its matte [h, w], uint8. Where the refined mask has less
-        than half or more than twice the area, a warning says so and the matte stays as it is.
-    """
-    # here: photographs are read while PyTorch is imported
+    """Refine the matte of a cut; keeps it, with a warning, if the area would change by more than a factor
+    of two."""
+    # imported here so that photographs are read while PyTorch is imported
     from ghgs_lit.data.matting import refined_matte
 
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
@@ -133,17 +121,8 @@ def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
 
 
 def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
-    """Place a crop along one axis; it ends where the photograph's border cuts the subject.
-
-    Args:
-        first: first pixel of the subject.
-        end: the pixel after its last one.
-        length: of the crop, in pixels of the photograph.
-        whole: length of the photograph.
-
-    Returns:
-        First pixel of the crop and the one after its last; they may lie beyond the photograph.
-    """
+    """Place a crop along one axis as (first, end) pixels, which may lie outside of the photograph; it ends
+    where the photograph's border cuts the subject."""
     if first == 0 and end == whole:
         return 0, whole
     start = (first + end - length) // 2
@@ -155,7 +134,7 @@ def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
 
 
 def _cut(image: np.ndarray, spans: list[tuple[int, int]]) -> np.ndarray:
-    """Pixels of ``spans`` (rows, then columns); 0 beyond the photograph."""
+    """Crop to ``spans`` (rows, then columns), with 0 outside of the photograph."""
     inside = tuple(slice(max(a, 0), min(b, side)) for (a, b), side in zip(spans, image.shape, strict=False))
     pads = [(max(-a, 0), max(b - side, 0)) for (a, b), side in zip(spans, image.shape, strict=False)]
     return np.pad(image[inside], pads + [(0, 0)] * (image.ndim - 2))

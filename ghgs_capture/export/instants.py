@@ -21,13 +21,13 @@ from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import orbit
 
-#: Swing of the video's camera to each side of the first photograph, in radians.
+#: Largest angle of the video's camera to each side of the first photograph, in radians
 _SWING = math.radians(20)
 _VIDEO_SIDE = 720  #: Least length of its pictures' longer side in pixels
 
 
 class Instants:
-    """Files of all instants together, beside their folders.
+    """Files that cover all instants, next to the folders of the instants.
 
     For ``html`` ``viewer.html``; for ``ply`` ``sequence/0000.ply`` and so on, which other programs
     import as a sequence; for ``mp4`` ``instants.mp4``. The cameras of page and video follow the
@@ -36,8 +36,8 @@ class Instants:
     Args:
         count: largest number of instants.
         options: formats, upward axis and pictures a second.
-        others: names of further files, whose contents are set in the attribute ``others`` before
-            writing.
+        others: names of further files, whose contents must be set in the attribute ``others`` before
+            :meth:`write`.
     """
 
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
@@ -52,7 +52,7 @@ class Instants:
 
     @property
     def files(self) -> list[str]:
-        """Names of the files that may be written, below the directory of all instants."""
+        """Names of the files that may be written, relative to the directory of all instants."""
         numbered = [f"sequence/{number:04d}.ply" for number in range(self.count)]
         names = {"html": ["viewer.html"], "ply": numbered, "mp4": ["instants.mp4"]}
         made = []
@@ -62,13 +62,13 @@ class Instants:
         return [*made, *self.others]
 
     def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:
-        """Keep what the files need of the next instant.
+        """Add the next instant.
 
         Args:
-            folder: that of the instant's own files.
+            folder: the folder of this instant's own files.
             batch: photographs, masks and cameras of one subject.
-            prediction: the subject's, of this batch.
-            renderer: draws the pictures of the video.
+            prediction: the prediction for this batch.
+            renderer: renders the frames of the video.
         """
         self.folders.append(folder)
         if not {"html", "mp4"} & {*self.options.formats}:
@@ -81,16 +81,16 @@ class Instants:
         self._boxes.append(torch.stack((points.amin(0), points.amax(0))).cpu().numpy())
 
     def write(self, directory: Path) -> list[Path]:
-        """Write the files, after all instants are added and their own files written.
+        """Write the files, after all instants have been added and their own files written.
 
         Args:
-            directory: that of all instants.
+            directory: the directory of all instants.
 
         Returns:
-            The paths, that of the report last; none if ``formats`` has no such file.
+            The paths, that of the report last; empty if ``formats`` has no such file.
 
         Raises:
-            InputError: a file of another origin is in the way.
+            InputError: a file that no earlier prediction wrote has one of the names.
         """
         self.count = len(self.folders)
         self.others = {name: made for name, made in self.others.items() if made}
@@ -98,7 +98,7 @@ class Instants:
         if not names:
             return []
         for name in begin_files(directory, names):
-            # of an earlier, longer sequence: programs would play these, too
+            # Files of an earlier, longer sequence would be played, too.
             if name.startswith("sequence/"):
                 (directory / name).unlink()
         contents = {name: partial(self.others.get, name) for name in self.others}
@@ -112,10 +112,9 @@ class Instants:
         return end_files(directory, names, {"instants": [folder.name for folder in self.folders]})
 
     def _path(self) -> np.ndarray:
-        """Shift of page and video at each instant [instants, 3]: the smoothed path of the
-        subject's mean."""
+        """Translation [instants, 3] of page and video: the smoothed path of the subject's mean."""
         reach = self.options.fps // 2
-        # Odd reflection at the ends: a steady walk stays steady.
+        # Odd reflection at the ends keeps a steady walk steady.
         padded = np.pad(np.stack(self._means), ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
         weights = np.hanning(2 * reach + 3)[1:-1]
         windows = np.lib.stride_tricks.sliding_window_view(padded, len(weights), axis=0)
@@ -128,8 +127,7 @@ class Instants:
         return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
-        """The content of the video: the camera swings by ``_SWING`` to each side,
-        once over all instants."""
+        """Render the video, in which the camera swings by ``_SWING`` to each side once over all instants."""
         first = self._first
         cameras = self._first.cameras
         path = self._path()
@@ -144,7 +142,7 @@ class Instants:
 
         def picture(frame: int) -> np.ndarray:
             gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
-            # Else large pictures would show gaps.
+            # Without it, large frames would show gaps.
             gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
             return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
 
@@ -158,19 +156,19 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-# Without these, a player guesses matrix and range, and may show other colours.
+# Without these, players guess the colour matrix and range.
 _COLORS = (
     "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
 )
 
 
 def mp4_bytes(pictures: Iterable[np.ndarray], fps: int) -> bytes:
-    """Encode pictures as a video; odd sides get one more row or column.
+    """Encode frames as a video; odd sides are padded by one row or column.
 
     Args:
-        pictures: [h, w, 3] uint8 of one size, at least one; taken one by one, so that a long video
+        pictures: [h, w, 3] uint8 of one size, at least one; consumed one by one, so that a long video
             fits in memory.
-        fps: pictures a second.
+        fps: frames per second.
 
     Returns:
         The content of an MP4 file.

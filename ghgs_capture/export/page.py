@@ -21,19 +21,19 @@ from ghgs_lit.types import Gaussians
 #: (opacity; rotation, to each side of 0): ``FINE`` for one instant, ``COARSE`` for each of several.
 FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
 COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
-#: A Gaussian's numbers of four bytes (its centre) and of one (the others).
+#: Numbers of each Gaussian that take four bytes (its centre) and one byte (the others).
 _WIDE = 3
 _NARROW = 10
 _LARGEST = 1 << 29
 
 
 def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
-    """Store Gaussians in few bytes, which ``page.html`` unpacks: planes [22, N].
+    """Quantise and compress Gaussians to byte planes [22, N], which ``page.html`` unpacks.
 
-    A Gaussian becomes whole numbers: its centre relative to ``center`` in parts of ``pixel``; the
+    Each Gaussian is converted to integers: its centre relative to ``center`` in parts of ``pixel``; the
     logarithms of its standard deviations; colour and opacity; and its rotation as ``v / (1 + w)``
-    of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as the difference from the
-    Gaussian before, mostly its neighbour's.
+    of the unit quaternion ``(w, v)`` with ``w >= 0``. Each number is stored as the difference from the
+    previous Gaussian, which is mostly a neighbour.
 
     Args:
         gaussians: of one subject, with RGB colours.
@@ -56,7 +56,7 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
     numbers = torch.cat([part.round().long() for part in parts], dim=1).numpy()
     numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue are like green
     wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
-    # with the sign as last bit, high bytes are mostly 0
+    # with the sign as the last bit, high bytes are mostly 0
     wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")
     planes = wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes()
     packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
@@ -64,14 +64,14 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
 
 
 def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians) -> Gaussians:
-    """The Gaussians of :func:`pack`, on the CPU.
+    """Restore the Gaussians of :func:`pack`, on the CPU.
 
     Args:
         data: the packed bytes.
         pixel: as given to :func:`pack`.
         center: as given to :func:`pack`.
         steps: as given to :func:`pack`.
-        like: Gaussians whose image constants (``low_pass``, ``antialiased``) they get.
+        like: Gaussians whose image constants (``low_pass``, ``antialiased``) are copied.
 
     Returns:
         The Gaussians of one subject, rounded to ``steps``, in float32.
@@ -96,7 +96,7 @@ def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], 
 
 
 def _signed(numbers: Tensor) -> Tensor:
-    """Numbers modulo 256, from -128 to 127."""
+    """Map numbers modulo 256 to the range from -128 to 127."""
     return (numbers + 128 & 255) - 128
 
 
@@ -107,14 +107,14 @@ def page(
     path: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
     fps: float = 1.0,
 ) -> str:
-    """A page that shows one instant or plays several, with a button for each camera.
+    """Create a page that shows one instant or plays several, with a button for each camera.
 
     Args:
         subject: the first instant; the page begins at its first camera.
         name: title of the page, as plain text.
         packed: :func:`pack` of each of several instants, with ``COARSE``; none: the subject alone.
-        path: shift of the page's camera at each instant [instants, 3].
-        fps: instants a second.
+        path: translation [instants, 3] of the page's camera at each instant.
+        fps: instants per second.
 
     Returns:
         The text of an HTML file.
@@ -143,7 +143,7 @@ def page(
     text = files("ghgs_capture.export").joinpath("page.html").read_text()
     values = {
         "title": html.escape(name),
-        # "<!--", "<script" and "</" mean something inside a script, too.
+        # "<!--", "<script" and "</" have a meaning inside a script, too.
         "scene": json.dumps(scene).replace("<", "\\u003c"),
         "data": "\n".join(base64.b64encode(instant).decode() for instant in packed),
     }

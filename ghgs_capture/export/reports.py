@@ -1,4 +1,4 @@
-"""``report.json`` of a directory lists the files of predictions; only those are replaced later."""
+"""``report.json`` of a directory lists the files of predictions; later runs replace only those."""
 
 import json
 import os
@@ -11,19 +11,19 @@ from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.parsing import read_json
 from ghgs_lit.runs.results import plain
 
-REPORT = "report.json"  #: The file that lists the others
+REPORT = "report.json"  #: Name of the file that lists the others
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace inputs, or files of other origin.
+    """Check that writing replaces neither inputs nor files that no prediction wrote.
 
     Args:
         directory: where files will be written.
-        names: of the files, below the directory; the report is checked, too.
+        names: of the files, relative to the directory; the report is checked, too.
         inputs: files that are read.
 
     Raises:
-        InputError: names the first file that is in the way.
+        InputError: a file would be replaced; the message names the first one.
     """
     read = {os.path.realpath(path) for path in inputs}
     written = _written_before(directory)
@@ -36,18 +36,17 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
-    """List files in the report before they are written, so that an interrupted run's are known,
-    too.
+    """List files in the report before they are written, so that it covers those of an interrupted run.
 
     Args:
         directory: where files will be written.
-        names: of the files, below the directory.
+        names: of the files, relative to the directory.
 
     Returns:
         Names of other files of earlier predictions.
 
     Raises:
-        InputError: a file of another origin is in the way.
+        InputError: a file that no earlier prediction wrote has one of the names.
     """
     require_free(directory, names)
     return _write_report(directory, dict.fromkeys(names), {})
@@ -58,7 +57,7 @@ def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) 
 
     Args:
         directory: where the files are.
-        names: of the files, below the directory.
+        names: of the files, relative to the directory.
         report: plain data, without NaN or infinity.
 
     Returns:
@@ -70,18 +69,18 @@ def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) 
 
 
 def write_file(path: Path, content: Callable[[], bytes]) -> None:
-    """Make and write a file.
+    """Compute a file's content and write it atomically.
 
     Args:
-        path: of the file, which is written whole or not at all.
-        content: makes what is written.
+        path: of the file.
+        content: returns the content.
     """
     made = content()
     write_atomically(path, lambda temporary: temporary.write_bytes(made))
 
 
 def _write_report(directory: Path, files: Mapping[str, int | None], report: Mapping[str, Any]) -> list[str]:
-    """Write the report, which also lists other files of earlier predictions, and give their names."""
+    """Write the report, which also lists other files of earlier predictions, and return their names."""
     written = _written_before(directory)
     earlier = [name for name in written if name not in (REPORT, *files) and (directory / name).exists()]
     kept = {"earlier_files": earlier} if earlier else {}
@@ -91,7 +90,7 @@ def _write_report(directory: Path, files: Mapping[str, int | None], report: Mapp
 
 
 def _written_before(directory: Path) -> list[str]:
-    """Names of the files that the report of a directory lists; none without a report."""
+    """Names of the files that the report of a directory lists; empty without a report."""
     try:
         report = read_json(directory / REPORT)
     except InputError:
