@@ -256,14 +256,13 @@ class Photographs:
         """
         size, target_size = sizes or (self.size, self.target_size)
         photos = [(sample.subject, sample.inputs) for sample in samples]
-        maps, names = self._collate(photos, depths, size)
+        maps, names = self._collate(photos, depths, size, with_alpha=True)
         bodies = [self.body(sample.subject) for sample in samples]
         has_bodies = all(body is not None for body in bodies)
         targets = None
         if samples[0].targets:
             photos = [(sample.subject, sample.targets) for sample in samples]
             target_maps, target_names = self._collate(photos, target_depths, target_size)
-            del target_maps["alpha"]
             targets = Targets(**target_maps, names=target_names, protocols=samples[0].protocols)
         return Batch(
             **maps,
@@ -274,7 +273,11 @@ class Photographs:
         )
 
     def _collate(
-        self, photos: Sequence[tuple[str, Sequence[Photo]]], depth: bool, size: Size | None
+        self,
+        photos: Sequence[tuple[str, Sequence[Photo]]],
+        depth: bool,
+        size: Size | None,
+        with_alpha: bool = False,
     ) -> tuple[dict[str, Any], tuple[tuple[str, ...], ...]]:
         """Maps [B, V, ...] and cameras of the photographs of B subjects, and the photographs' names;
         None for a map that a photograph lacks."""
@@ -293,6 +296,7 @@ class Photographs:
             "masks": stack("mask"),
             "cameras": Cameras(stack("intrinsics"), stack("extrinsics"), *views[0].mask.shape),
             "depths": stack("depth"),
-            "alpha": stack("alpha"),
         }
+        if with_alpha:
+            maps["alpha"] = stack("alpha")
         return maps, tuple(tuple(map(photo_name, several)) for _, several in photos)

@@ -3,8 +3,8 @@ and what happens where there are more.
 
 Reading the number of intersections would be a device-to-host synchronisation before anything is
 rendered. So each rendering gets the room that similar ones needed, and some more; the number that it
-really needed is read after the rendering, or after several together (:func:`settled`). Where the room
-was too small the rendering is repeated with enough: an image never lacks splats."""
+really needed is read later: while the GPU renders, or after several renderings (:func:`settled`). Where
+the room was too small the rendering is repeated with enough: an image never lacks splats."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -118,7 +118,7 @@ def with_room(
     find: Callable[[int], tuple[T, Tensor]],
     draw: Callable[[T], Drawn],
 ) -> Drawn:
-    """What is drawn with enough room, as of :func:`settled`.
+    """What is drawn with enough room.
 
     Args:
         grid: tiles of an image (rows, columns).
@@ -130,11 +130,38 @@ def with_room(
         What ``draw`` returned last. Inside :func:`deferred` it may lack splats: the caller
         checks the rooms.
     """
-
-    def call() -> Drawn:
+    rooms = _rooms.get()
+    while True:
         capacity = bucket_size(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
         intersections, needed = find(capacity)
-        _rooms.get().rooms.append(Room(grid, splats, capacity, needed))
-        return draw(intersections)
+        room = Room(grid, splats, capacity, needed)
+        number = Coming(needed) if rooms is None else None
+        drawn = draw(intersections)
+        if rooms is not None:
+            rooms.rooms.append(room)
+            return drawn
+        if room.expect(number.read()):
+            return drawn
 
-    return settled(call)
+
+class Coming:
+    """A number on its way to the host, which can go on until it reads it.
+
+    Args:
+        value: a scalar on any device.
+    """
+
+    def __init__(self, value: Int[Tensor, ""]):
+        self.value = value
+        self.arrived = None
+        if value.is_cuda:
+            self.value = torch.empty((), dtype=value.dtype, pin_memory=True)
+            self.value.copy_(value, non_blocking=True)
+            self.arrived = torch.cuda.Event()
+            self.arrived.record(torch.cuda.current_stream(value.device))
+
+    def read(self) -> int:
+        """The number; waits for what the device was asked before it was made, and no longer."""
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        return int(self.value)
