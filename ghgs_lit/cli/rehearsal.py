@@ -15,9 +15,9 @@ from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
+from ghgs_lit.runs.plan import PlannedRun, Rehearsal, print_plan
 from ghgs_lit.runs.results import config_hash
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.sweep import PlannedRun, Rehearsal, print_plan
 from ghgs_lit.training import start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -159,7 +159,7 @@ def _summarize(lines: Iterable[str]) -> list[str]:
 
 
 def plan(run: "Train") -> None:
-    """Print the plan of a single run, as of :func:`ghgs_lit.runs.sweep.print_plan`.
+    """Print the plan of a single run, as of :func:`ghgs_lit.runs.plan.print_plan`.
 
     Args:
         run: as configured.

@@ -1,17 +1,15 @@
 """Sweeps (``hydra/sweeper=grid``): the plan of a grid's runs, and the launch of those that are not done."""
 
 import contextlib
-import datetime
 import json
 import logging
 import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
@@ -19,7 +17,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf, open_dict
-from tabulate import tabulate
 
 from ghgs_lit.config.compose import check_ablation, chosen_options, plain, saved_text
 from ghgs_lit.config.defaults import fill
@@ -29,6 +26,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_writable, resolved, write_text_atomically
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
+from ghgs_lit.runs.plan import PlannedRun, Rehearse, print_plan, print_states, shared_overrides
 from ghgs_lit.runs.processes import (
     Interrupted,
     interruptible,
@@ -36,16 +34,10 @@ from ghgs_lit.runs.processes import (
     queue_again,
     stop_if_interrupted,
 )
-from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.results import config_hash, differences
 from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State, runs_in_order
 
-if TYPE_CHECKING:
-    from ghgs_lit.cli.verbs import Train
-    from ghgs_lit.training.trainer import TrainerOptions
-
 log = logging.getLogger(__name__)
-OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
 _POLL = 2.0  # seconds between checks of runs that other processes work on
 #: Words in sbatch's errors, and the keys of the launcher that they are about.
 _SBATCH_KEYS = {
@@ -61,40 +53,7 @@ _SBATCH_KEYS = {
 }
 
 
-@dataclass(frozen=True)
-class PlannedRun:
-    """A run of a sweep.
-
-    Attributes:
-        name: Hash of its configuration.
-        overrides: Of the job, with its directory.
-        shown: Overrides to print.
-        run: Its configuration.
-        directory: Of the run.
-    """
-
-    name: str
-    overrides: tuple[str, ...]
-    shown: tuple[str, ...]
-    run: "Train"
-    directory: RunDirectory
-
-
-@dataclass(frozen=True)
-class Rehearsal:
-    """Result of the checks of a dry run.
-
-    Attributes:
-        reasons: Why runs would be rejected.
-        notes: What else a user should know.
-    """
-
-    reasons: Sequence[str] = ()
-    notes: Sequence[str] = ()
-
-
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
-Rehearse = Callable[[Sequence["Train"]], Rehearsal]
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
@@ -139,7 +98,7 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
     metrics = [item.directory.metric for item in planned]
     shown = ["" if metric is None else f"{metric:.2f}" for metric in metrics]
     sessions = [str(len(item.directory.sessions())) for item in planned]
-    _print_states(planned, {"PSNR": shown, "sessions": sessions})
+    print_states(planned, {"PSNR": shown, "sessions": sessions})
     print(f"wrote {directory}", flush=True)
     for result in returns:
         _ = result.return_value  # raises what the job raised
@@ -239,10 +198,6 @@ def _print_differing(planned: Sequence[PlannedRun], directory: Path) -> None:
         )
 
 
-def _shared_overrides(planned: Sequence[PlannedRun]) -> set[str]:
-    return set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
-
-
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
     """Write each run's configuration, by which tables list planned runs, and its overrides that the
     other runs do not have.
@@ -252,7 +207,7 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
         config: Configuration of the command, for ``multirun.yaml``, which also lists the runs.
         directory: Of the sweep.
     """
-    shared = _shared_overrides(planned)
+    shared = shared_overrides(planned)
     titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
     for item in planned:
         place = item.directory
@@ -346,96 +301,3 @@ def _check_accounting() -> None:
             SlurmJob.watcher._make_command = lambda: None
             message = " ".join(answer.stderr.split()) or "sacct fails"
             print(f"note: {message}: the sweep waits for jobs that are cancelled, too", flush=True)
-
-
-def step_seconds(directory: Path) -> tuple[float, int] | None:
-    """Mean seconds of a training step of a sweep's finished runs, and their number; None: none has
-    finished."""
-    steps = seconds = count = 0
-    for path in directory.rglob("metrics.json"):
-        sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
-        steps += sum(s["steps"] for s in sessions)
-        seconds += sum(s["seconds"] for s in sessions)
-        count += bool(sessions)
-    return (seconds / steps, count) if steps else None
-
-
-def time_budget(trainer: "TrainerOptions") -> float | None:
-    """Seconds of ``trainer.max_time``, which is ``days:hours:minutes:seconds`` or a mapping; None: no
-    limit."""
-    value = trainer.max_time
-    if isinstance(value, str):
-        value = dict(zip(("days", "hours", "minutes", "seconds"), map(int, value.split(":")), strict=True))
-    return None if value is None else datetime.timedelta(**value).total_seconds()
-
-
-def _print_states(
-    planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]], end: str = ""
-) -> list[State]:
-    """Print a table of the runs and the number of runs in each state."""
-    shared = _shared_overrides(planned)
-    states = [item.directory.state for item in planned]
-    overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
-    table = {"run": [item.name for item in planned], "state": [s.value for s in states], **columns}
-    print(tabulate(table | {"overrides": overrides}, "keys", disable_numparse=True))
-    counts = ", ".join(f"{states.count(state)} {state.value}" for state in State if state in states)
-    print(f"{len(planned)} runs: {counts}{end}")
-    return states
-
-
-def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
-    """Print the runs with their states, the training time of the remaining ones, the output paths
-    and what is missing.
-
-    Args:
-        planned: All runs of the sweep.
-        directory: Of the sweep.
-        rehearse: Checks what the runs need that are not done.
-
-    Raises:
-        InputError: Something is missing.
-    """
-    rehearsal = rehearse([item.run for item in planned if not item.directory.done])
-    measured = step_seconds(directory)
-    budgets, remaining, is_limited = [], [], False
-    for trainer, is_done in ((item.run.trainer, item.directory.done) for item in planned):
-        limit = time_budget(trainer)
-        is_limited |= limit is not None
-        times = [] if limit is None else [limit]
-        if measured and trainer.max_steps > 0:
-            times.append(trainer.max_steps * measured[0])
-        expected = min(times, default=None)
-        budgets.append(f"{trainer.max_steps} steps" if expected is None else clock(expected))
-        if not is_done:
-            remaining.append(expected)
-    states = _print_states(planned, {"trains for": budgets}, "; nothing was run")
-    basis = ["trainer.max_time"] if is_limited else []
-    if measured:
-        basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
-    total = "unknown" if None in remaining else clock(sum(remaining))
-    reason = "; ".join(basis) or "no trainer.max_time, and no step was measured"
-    print(f"expected training time of the remaining runs, one after another: {total} ({reason})")
-    place = f"{directory}/<run>" if len(planned) > 1 else planned[0].directory.path
-    print(f"outputs: {place}/ with {OUTPUTS}", flush=True)
-    for note in rehearsal.notes:
-        print(f"note: {note}")
-    reasons = [*rehearsal.reasons, *_unreadable(planned, states)]
-    for reason in reasons:
-        print(f"would be refused: {reason}", flush=True)
-    count = len(reasons)
-    if count:
-        raise InputError(f"dry_run: expected runs that lack nothing; found {count} missing, as said above")
-
-
-def _unreadable(planned: Sequence[PlannedRun], states: Sequence[State]) -> list[str]:
-    """What is wrong with checkpoints that runs would resume, a line each."""
-    from ghgs_lit.weights.checkpoint import read_checkpoint  # here: it imports PyTorch
-
-    lines = []
-    for item, state in zip(planned, states, strict=True):
-        if state == State.PARTIAL:
-            try:
-                read_checkpoint(item.directory.checkpoint)
-            except (InputError, OSError) as error:
-                lines.append(f"{' '.join(str(error).split())} (without this file the run begins anew)")
-    return lines

@@ -17,9 +17,10 @@ from ghgs_lit.config.registry import verb_class
 from ghgs_lit.config.run import Run
 from ghgs_lit.runs import job as job_module
 from ghgs_lit.runs.job import register_resolvers, train_once
+from ghgs_lit.runs.plan import PlannedRun, Rehearsal
 from ghgs_lit.runs.results import config_hash, provenance, write_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.sweep import PlannedRun, Rehearsal, run_all
+from ghgs_lit.runs.sweep import run_all
 
 register_resolvers()
 

@@ -10,9 +10,9 @@ import pytest
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.job import check_config
+from ghgs_lit.runs.plan import step_seconds
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
-from ghgs_lit.runs.sweep import step_seconds
 from tests.helpers.jobs import (
     executed,
     hold_run,

@@ -11,8 +11,9 @@ from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job
+from ghgs_lit.runs.plan import time_budget
 from ghgs_lit.runs.results import config_hash, read_results
-from ghgs_lit.runs.sweep import combinations, run_all, time_budget
+from ghgs_lit.runs.sweep import combinations, run_all
 from ghgs_lit.training.trainer import TrainerOptions
 from tests.cli.test_main import call
 from tests.helpers.jobs import (

@@ -6,8 +6,9 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import run_of
+from ghgs_lit.runs.plan import PlannedRun
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.sweep import PlannedRun, write_plan
+from ghgs_lit.runs.sweep import write_plan
 from ghgs_lit.training.loggers import TensorBoardOptions
 
 SHARED = ("experiment=demo", "data.root=a/b", "evaluation.views=[3,4]")

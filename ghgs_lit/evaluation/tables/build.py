@@ -12,7 +12,8 @@ from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table, TableOptions, data_title, paper
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
-from ghgs_lit.evaluation.tables.runs import SETTING, TRAINING, Planned, Sweep, Variant
+from ghgs_lit.evaluation.tables.runs import SETTING, TRAINING, Planned, Sweep
+from ghgs_lit.evaluation.tables.variants import Variant
 
 BASELINES = {
     "black": "Black image",

@@ -10,8 +10,9 @@ import pandas as pd
 from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of, paper
-from ghgs_lit.evaluation.tables.runs import ABSENT, TRAINING, describe, differing
+from ghgs_lit.evaluation.tables.runs import TRAINING
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
+from ghgs_lit.evaluation.tables.variants import ABSENT, describe, differing
 
 
 def fill(table: Table) -> None:

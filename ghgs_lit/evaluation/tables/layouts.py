@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.evaluation.tables.runs import Planned, Variant
+from ghgs_lit.evaluation.tables.runs import Planned
+from ghgs_lit.evaluation.tables.variants import Variant
 from ghgs_lit.parsing import read_yaml
 
 

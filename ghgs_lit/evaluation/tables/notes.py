@@ -6,8 +6,8 @@ from typing import Any
 import pandas as pd
 
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, metric_of, paper
-from ghgs_lit.evaluation.tables.runs import ablation_sets, describe, differing
 from ghgs_lit.evaluation.tables.significance import POWER
+from ghgs_lit.evaluation.tables.variants import ablation_sets, describe, differing
 
 MARK = "*"
 FOOTNOTE = (

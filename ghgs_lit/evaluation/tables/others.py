@@ -7,7 +7,8 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.runs import SETTING, Variant
+from ghgs_lit.evaluation.tables.runs import SETTING
+from ghgs_lit.evaluation.tables.variants import Variant
 from ghgs_lit.parsing import read_json
 from ghgs_lit.runs.results import validated
 

@@ -6,94 +6,30 @@ A run is identified by its configuration, never by the name of its directory.
 import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field
 
-from ghgs_lit.config import conf_dir
-from ghgs_lit.config.keys import (
-    EXPECTED_TO_DIFFER,
-    OF_A_PLACE,
-    OF_A_RUN,
-    OF_TARGETS,
-    OF_TRAINING,
-    ablation_of,
-    flatten,
-    is_below,
-    is_own_ablation,
-    lookup,
-    switches_of,
-)
+from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.evaluation.tables.variants import (
+    TRAINING_COUNTS,
+    Variant,
+    find_keys_of_rows,
+    find_views_of_columns,
+    name_variants,
+)
 from ghgs_lit.parsing import read_yaml
-from ghgs_lit.runs.results import METHOD, config_hash, read_results, validated
+from ghgs_lit.runs.results import METHOD, read_results, validated
 from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]
 """What numbers in one column must have in common."""
 TRAINING = {"steps": ("steps", 1), "seconds": ("seconds", 1), "peak_gb": ("peak_bytes", 1e9)}
 """Metrics of the training, which no subject has, with their keys in the provenance and units."""
-ABSENT = "absent"
-"""Text of a value that a configuration does not have."""
-TRAINING_COUNTS = "views.training_counts"
-#: Titles of keys that distinguish rows without being named by the user.
-_KEY_TITLES = {
-    TRAINING_COUNTS: "trained with {} views",
-    "views.training": "input views in training: {}",
-    "targets.training_views": "target views in training: {}",
-    "targets.per_step": "targets a step: {}",
-    "targets.kind": "targets: {}",
-    "targets.view": "target view {}",
-    "targets.positions": "positions of targets: {}",
-    "targets.per_subject": "targets a subject: {}",
-}
-#: Keys that identify an encoder of conf/encoder; models change its other keys.
-_ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
-
-
-@dataclass(frozen=True)
-class Variant:
-    """Identity of a row of a table.
-
-    Attributes:
-        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
-        name: Of the method.
-        model: Name of the model, with what sets it apart from the shipped one; empty for other methods.
-        encoder: Name of its encoder; empty for other methods.
-        ablation: The chosen option; empty for other methods.
-        switches: Whether its 3D unprojection and semantic consistency are on.
-        has_semantics: Whether the semantic features were trained (published weights or `ghgs pretext`);
-            unknown before training starts, so it does not distinguish rows.
-        extra: Further configuration keys and values that do.
-    """
-
-    kind: str
-    name: str
-    model: str = ""
-    encoder: str = ""
-    ablation: str = ""
-    switches: tuple[bool, bool] | None = None
-    has_semantics: bool = field(default=True, compare=False)
-    extra: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def is_own(self) -> bool:
-        """Whether this is a row of a user's own ablation."""
-        return bool(self.ablation) and is_own_ablation(self.ablation)
-
-    @property
-    def titles(self) -> list[str]:
-        """What distinguishes the row beyond model, encoder and ablation, in words."""
-        return [_KEY_TITLES.get(key, key + "={}").format(value.strip("[]")) for key, value in self.extra]
-
-    @property
-    def trained(self) -> tuple:
-        """Identity of the model without its ablation."""
-        return (self.model, self.encoder, self.extra)
 
 
 class Planned(NamedTuple):
@@ -124,132 +60,6 @@ class Sweep:
     planned: list[Planned]
     configs: dict[str, Mapping[str, Any]]
     order: list[Variant]
-
-
-@cache
-def _shipped(group: str) -> dict[str, dict]:
-    return {path.stem: read_yaml(path) for path in (conf_dir() / group).glob("*.yaml")}
-
-
-def encoder_name(config: Mapping[str, Any]) -> str:
-    """Name of the encoder in a configuration.
-
-    Args:
-        config: Resolved configuration of a training.
-
-    Returns:
-        The option of conf/encoder with its sizes, or ``unnamed``, and whether it has a semantic branch.
-    """
-    encoder = config.get("encoder")
-    encoder = encoder if isinstance(encoder, Mapping) else {}
-    branch = ", semantic branch" * (encoder.get("semantic") is not None)
-    values = flatten({key: encoder.get(key) for key in _ENCODER_KEYS})
-    for name, shipped in sorted(_shipped("encoder").items()):
-        # A file lists of a nested mapping only what differs from the file below it.
-        if flatten({key: shipped.get(key) for key in _ENCODER_KEYS}).items() <= values.items():
-            return name + branch
-    return "unnamed" + branch
-
-
-def ablation_sets(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted keys with the values that the chosen ablation of a training sets; empty if unknown."""
-    sets = lookup(config, "chosen.sets")
-    return dict(sets) if isinstance(sets, Mapping) else {}
-
-
-def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
-    """The row that a model belongs to.
-
-    Args:
-        config: Configuration of the model as trained and measured.
-        source: File of the configuration, for messages.
-        by: Keys that distinguish rows beyond model, encoder and ablation.
-
-    Raises:
-        InputError: The configuration has no recalibration, of which the ablation takes parts away.
-    """
-    recalibration = config.get("recalibration")
-    require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
-    compat = lookup(config, "compat.name")
-    ablation = ablation_of(config)
-    encoder = encoder_name(config)
-    # A user's option of conf/model may have kept the name of the one that it changes.
-    model = lookup(config, "chosen.model")
-    if model is None or model in _shipped("model"):
-        model = str(lookup(config, "model.name") or "unnamed")
-    model += f", compat {compat}" * (compat not in (None, "none"))
-    # What a user's ablation changes is a row of the model's table, not another model. The paper's
-    # ablations find neighbours in 3D or on the image plane.
-    if is_own_ablation(ablation):
-        if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
-            encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
-    elif recalibration.get("neighborhood") == "feature":
-        model += ", neighbours by feature"
-    extra = tuple((key, str(lookup(config, key))) for key in by)
-    # Without such weights the encoder has learned from the rendering loss only.
-    has_semantics = bool(lookup(config, "encoder.weights"))
-    return Variant("model", "ours", model, encoder, ablation, switches_of(config), has_semantics, extra)
-
-
-def _views_of_columns(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Numbers of views by file of models that fill one column each: models on the same data that were
-    trained with one number of views each, and not all with the same one."""
-    counts: dict[str, dict[str, int]] = {}
-    for path, config in configs.items():
-        trained = lookup(config, TRAINING_COUNTS)
-        if isinstance(trained, list | tuple) and len(trained) == 1:
-            counts.setdefault(str(lookup(config, "data.name")), {})[path] = trained[0]
-    several = [of_data for of_data in counts.values() if len(set(of_data.values())) > 1]
-    return dict(itertools.chain.from_iterable(map(dict.items, several)))
-
-
-def _keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Keys of views and targets in which runs that could share a row differ: runs on the same data
-    by how they were trained, those with a protocol of the same name by its targets."""
-    values: dict[tuple[str, ...], set[str]] = {}
-    for config in configs:
-        data = str(lookup(config, "data.name"))
-        protocol = str(lookup(config, "targets.name"))
-        places = [(key, data) for key in OF_TRAINING] + [(key, data, protocol) for key in OF_TARGETS]
-        for place in places:
-            values.setdefault(place, set()).add(str(lookup(config, place[0])))
-    return [key for (key, *_), different in values.items() if len(different) > 1]
-
-
-def _variants_of(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:
-    """Variants by file. Models of one configuration have one row, whatever their ablations are called:
-    by the paper's name if one has it."""
-    variants = {path: model_variant(config, path, by) for path, config in configs.items()}
-    keys = {path: config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for path, config in configs.items()}
-    names: dict[str, str] = {}
-    for path, variant in variants.items():
-        if keys[path] not in names or not variant.is_own:
-            names[keys[path]] = variant.ablation
-    return {path: replace(variant, ablation=names[keys[path]]) for path, variant in variants.items()}
-
-
-def differing(
-    configs: Sequence[Mapping[str, Any]], expected: Iterable[str] = EXPECTED_TO_DIFFER
-) -> dict[str, list[str]]:
-    """Dotted keys in which configurations differ, with their values as text, ``ABSENT`` among them.
-
-    Args:
-        configs: Of several runs.
-        expected: Keys that may differ, with those below them.
-    """
-    flat = [flatten(config) for config in configs]
-    texts = {}
-    for key in dict.fromkeys(itertools.chain.from_iterable(flat)):
-        values = list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat))
-        if len(values) > 1 and not is_below(key, expected):
-            texts[key] = values
-    return texts
-
-
-def describe(keys: Mapping[str, Sequence[str]]) -> str:
-    """The first keys and values of :func:`differing`, such as ``optimizer.lr (0.001, 0.0001)``."""
-    shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:6]]
-    return ", ".join(shown) + (f" and {len(keys) - 6} more" if len(keys) > 6 else "")
 
 
 class _Strict(BaseModel):
@@ -385,10 +195,10 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
     configs = {**models, **trainings}
-    views = {} if TRAINING_COUNTS in by else _views_of_columns(configs)
+    views = {} if TRAINING_COUNTS in by else find_views_of_columns(configs)
     for path in views:  # which differ no more by the number of views in training
         configs[path] = {**configs[path], "views": {**configs[path]["views"], "training_counts": "as many"}}
-    variants = _variants_of(configs, list(dict.fromkeys([*by, *_keys_of_rows(configs.values())])))
+    variants = name_variants(configs, list(dict.fromkeys([*by, *find_keys_of_rows(configs.values())])))
     frames = []
     planned = []
     paths = _in_order({**runs, **trainings}, folders, variants)

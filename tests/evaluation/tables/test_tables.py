@@ -22,7 +22,7 @@ from ghgs_lit.evaluation.tables import (
     to_markdown,
     to_terminal,
 )
-from ghgs_lit.evaluation.tables.runs import encoder_name
+from ghgs_lit.evaluation.tables.variants import encoder_name
 from ghgs_lit.evaluation.tables.writers import escape, prose
 from ghgs_lit.runs.results import config_hash, read_results, summarize, write_results
 from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, other, views
