@@ -63,7 +63,9 @@ def test_samples_are_those_of_the_folder(root, options):
     resized once, in each step, or not at all."""
     assert same(root, **options)
     assert files(root)
-    assert batches(root, **options)[0].depths is not None
+    first = batches(root, **options)[0]
+    assert first.depths is not None
+    assert first.alpha is not None
 
 
 def test_samples_come_from_the_packed_files(root):

@@ -100,6 +100,33 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_goes_on(scans, referen
     assert render_people(root, names, source, RIG, SMALL, 0, workers=0) == 0
 
 
+@dataclass(frozen=True)
+class Slow:
+    """A source that notes in ``log`` whom it loads; all people are bad."""
+
+    log: Path
+
+    def load(self, name):
+        with open(self.log, "a") as file:
+            file.write(f"{name}\n")
+        time.sleep(0.3)
+        raise InputError(f"{name}: expected a person; found a test")
+
+    def facing(self, name):
+        return 0.0
+
+
+def test_an_interrupted_rendering_begins_no_further_people(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs.log, "warning", interrupt)
+    names = {"train": [f"s{i}" for i in range(12)]}
+    with pytest.raises(KeyboardInterrupt):
+        render_people(tmp_path / "out", names, Slow(tmp_path / "log"), RIG, SMALL, 0, workers=2)
+    assert len((tmp_path / "log").read_text().split()) < 12
+
+
 def render_at_once(barrier, root: Path, scans: Path, log: Path) -> None:
     barrier.wait()
     names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
