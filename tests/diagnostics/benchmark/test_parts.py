@@ -29,6 +29,7 @@ from ghgs_lit.diagnostics.benchmark.measure import (
     top_level,
     watched,
 )
+from ghgs_lit.diagnostics.benchmark.report import broken_budgets
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
@@ -116,6 +117,32 @@ MANY[:3] = torch.tensor([9.0, 3.0, 5.0])  # decisions within rounding; a defect 
 def test_relative_differences_are_always_defined(found, expected, share, difference):
     """An empty or broken result must not pass a budget as nan; budgets look at most values."""
     assert relative_difference(found, expected, share) == difference
+
+
+KEPT = {
+    "preset": "fast", "trained": True, "psnr_loss_db": 0.01, "budget_db": 0.02, "difference_db": 0.01,
+    "max_rel_diff_budget": 1e-5, "rel_diff": 1e-6, "differences": {"unmatched": 0.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "broken"),
+    [
+        ({}, []),
+        ({"psnr_loss_db": 0.03}, ["a loss"]),
+        ({"psnr_loss_db": math.nan, "max_rel_diff_budget": None}, ["a loss"]),
+        ({"psnr_loss_db": 0.03, "trained": False}, []),
+        ({"difference_db": 0.03}, ["a loss"]),
+        ({"difference_db": 0.03, "max_rel_diff_budget": None}, []),
+        ({"rel_diff": math.nan}, ["rel_diff"]),
+        ({"differences": {"unmatched": 0.1}}, ["the Gaussians"]),
+    ],
+)
+def test_budgets(change, broken):
+    """A preset that promises equal results also keeps the loss that its difference may cost."""
+    lines = broken_budgets({**KEPT, **change})
+    assert len(lines) == len(broken)
+    assert all(f"fast: expected {text}" in line for line, text in zip(lines, broken, strict=True))
 
 
 def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scene, monkeypatch):
