@@ -1,4 +1,4 @@
-"""Training: the LightningModule, optimization and callbacks."""
+"""Training: LightningModules, optimization, callbacks and loggers."""
 
 from ghgs_lit.training.guard import DivergedError
 from ghgs_lit.training.module import GHGSModule

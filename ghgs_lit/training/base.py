@@ -1,5 +1,5 @@
-"""Base of the LightningModules of this package: a schedule over the run's budget,
-plain checkpoints."""
+"""Base of the LightningModules: a learning-rate schedule over the run's budget of steps or time,
+and checkpoints of plain data."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,25 +19,25 @@ from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
 
 def image_mean() -> MeanMetric:
-    """A mean over the images of a validation, in float64; nan is left out."""
+    """Mean over all images of a validation, in float64; ignores NaN."""
     return MeanMetric(nan_strategy="ignore").set_dtype(torch.float64)
 
 
 class BudgetedModule(L.LightningModule):
-    """A module whose learning rate follows the used share of the run's budget.
+    """LightningModule whose learning rate depends on the used share of the run's budget.
 
     Args:
-        model: trained. All other parts with weights, such as a loss, are trained, clipped, frozen
-            and saved with it; checkpoints hold the model's tensors under ``model.``, others under
-            the part's name.
+        model: the model to train. Other submodules with weights, such as a loss, are trained, clipped,
+            frozen and saved with it; checkpoints store the model's tensors under ``model.`` and those
+            of other submodules under their names.
         optimization: options of the optimizer and its schedule.
-        config: the run's full configuration as plain data, of which ``seed`` is read; checkpoints
-            contain it together with the model's own. None: only that of the model.
+        config: the run's full configuration as plain data, with ``seed`` (0 if missing). Checkpoints
+            contain it, merged into the model's configuration. None: only the model's.
 
     Attributes:
-        ready: time mark of the end of the last step and all that followed,
-            from where a step waits for data.
-        used_budget: used share of the run's budget in [0, 1], as of the last step."""
+        ready: time at which the last step, its callbacks and any validation ended; the wait for data
+            is measured from here.
+        used_budget: used share of the run's budget in [0, 1] at the last step."""
 
     def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any] | None):
         super().__init__()
@@ -48,65 +48,58 @@ class BudgetedModule(L.LightningModule):
         self.ready = time_mark(torch.device("cpu"))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Copy a batch without a synchronisation where its memory is pinned.
-
-        Args:
-            batch: of the data.
-            device: of the training.
-            dataloader_idx: not used.
-
-        Returns:
-            The batch there."""
-        # Lightning copies unknown structures one tensor at a time, and waits for each.
+        """Copy a batch to a device, without a synchronisation if its memory is pinned."""
+        # Lightning copies unknown structures tensor by tensor and synchronises after each.
         return batch.to(device, non_blocking=device.type != "cpu")
 
     def on_train_start(self) -> None:
-        """Continue at the budget's used share, with this run's options of the optimizer."""
+        """Resume the used share of the budget, and apply this run's options of the optimizer."""
         self.ready = time_mark(self.device)
-        # After a restart the scheduler updates it only after a step.
+        # After a restart the scheduler would update it only at the end of the first step.
         self.used_budget = self.progress()
-        # This run's options of the optimizer replace those of a resumed checkpoint.
+        # Lightning has restored the options that the checkpoint was trained with.
         optimizer = self.optimizers()
         schedule = self.lr_schedulers()
         for number, (group, option) in enumerate(zip(optimizer.param_groups, self._options, strict=True)):
-            # The rate itself includes the schedule's factor of the next step.
+            # The restored rate includes the schedule's factor for the next step.
             rate = group["lr"] * option["lr"] / schedule.base_lrs[number]
             group.update(option, lr=rate, initial_lr=option["lr"])
             schedule.base_lrs[number] = option["lr"]
         hold_rates(optimizer)
 
     def on_train_batch_start(self, *args: Any) -> None:
-        """Correct Lightning's count of steps."""
-        # Lightning's own count is one ahead in a run that goes on from the end of another session.
+        """Correct Lightning's count of steps, which is one too high after a run resumes from the end of
+        an earlier session."""
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.global_step
 
     def step_seed(self, batch_idx: int) -> int:
-        """Seed of the random numbers of this step: the same after an interruption, and in all
-        processes, so that none waits for one that has sampled more rounds.
+        """Seed of this step's random numbers, the same after an interruption and in all processes, so
+        that all sample the same number of rounds and none waits for another.
 
         Args:
-            batch_idx: of Lightning, which distinguishes the parts of an accumulated step.
+            batch_idx: Lightning's index, which distinguishes the batches of an accumulated step.
 
         Returns:
-            A number of 32 bits, of the run's seed, the step and the part."""
+            A 32-bit number, hashed from :meth:`step_numbers`."""
         return int(np.random.SeedSequence(self.step_numbers(batch_idx)).generate_state(1)[0])
 
     def step_numbers(self, batch_idx: int) -> list[int]:
-        """Seeds all randomness of the step: seed of the run, step, and part of an accumulated step."""
+        """The run's seed, the step, and the index of the batch within an accumulated step. Together they
+        seed all randomness of the step."""
         part = batch_idx % self.trainer.accumulate_grad_batches
         return [self.config.get("seed", 0), self.global_step, part]
 
     def class_numbers(self, batch_idx: int) -> list[int] | None:
-        """The same for what ``data.class_steps`` consecutive batches share; None: they share nothing."""
+        """Seed for choices that ``data.class_steps`` consecutive batches share; None if that is 1."""
         steps = (self.config.get("data") or {}).get("class_steps", 1)
         seed, step, part = self.step_numbers(batch_idx)
         return None if steps == 1 else [seed, (step * self.trainer.accumulate_grad_batches + part) // steps]
 
     def progress(self) -> float:
-        """Used share of the budget.
+        """Used share of the budget of steps or of time, whichever is larger.
 
         Returns:
-            The share in [0, 1] of steps or of time, whichever is larger; the same in all processes.
+            A number in [0, 1], the same in all processes.
 
         Raises:
             InputError: the run has no budget."""
@@ -120,7 +113,7 @@ class BudgetedModule(L.LightningModule):
             used = timer.time_elapsed()
             share = used / max(used + timer.time_remaining(), 1e-9)
             if trainer.world_size > 1 and used > 0:
-                # Clocks of processes differ, but learning rates must not.
+                # Clocks differ between processes, but learning rates must not.
                 mine = torch.tensor(share, device=self.device)
                 share = float(trainer.strategy.reduce(mine, reduce_op="max"))
             shares.append(share)
@@ -132,8 +125,8 @@ class BudgetedModule(L.LightningModule):
         """Log the learning rate, the used budget and further numbers of a step under ``train/``.
 
         Args:
-            size: elements of the batch.
-            **numbers: by name."""
+            size: batch size.
+            **numbers: values by the rest of their tag."""
         numbers = {
             "learning_rate": self.optimizers().param_groups[0]["lr"],
             "budget": self.used_budget,
@@ -141,7 +134,7 @@ class BudgetedModule(L.LightningModule):
         }
         values = {}
         for name, number in numbers.items():
-            # Made where the model is: a number that is copied to a GPU makes the host wait.
+            # Created on the model's device: copying a number there would be a synchronisation.
             is_there = isinstance(number, torch.Tensor)
             values[f"train/{name}"] = number if is_there else torch.full((), number, device=self.device)
         self.log_dict(values, batch_size=size)
@@ -151,7 +144,7 @@ class BudgetedModule(L.LightningModule):
         return getattr(self.trainer.precision_plugin, "scaler", None)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        """The optimizer of all weights and its schedule, which follows the used budget."""
+        """Build the optimizer of all weights, and its schedule over the used budget."""
         options = getattr(self.model, "options", None)
         captures = getattr(options, "capture", "auto") == "auto"
         optimizer = self.optimization.optimizer(self, self._scaler is None, captures)
@@ -166,33 +159,27 @@ class BudgetedModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_batch_end(self, *args: Any) -> None:
-        """Note when the step ended."""
-        self.ready = time_mark(self.device)  # called after all callbacks
+        """Store the time at which the step ended."""
+        self.ready = time_mark(self.device)  # Lightning calls this after all callbacks
 
     def on_validation_end(self) -> None:
-        """The next step does not wait for data as long as the validation took."""
+        """Exclude the validation from the next step's wait for data."""
         self.on_train_batch_end()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check that Muon does not resume from AdamW's state, or vice versa.
 
-        Args:
-            checkpoint: of Lightning.
-
         Raises:
-            InputError: names ``optimizer.matrix_scale``."""
-        scale = getattr(self.optimization, "matrix_scale", None)  # a plug-in's may have none
+            InputError: they differ; the message names ``optimizer.matrix_scale``."""
+        scale = getattr(self.optimization, "matrix_scale", None)  # a plug-in may lack this option
         for state in checkpoint.get("optimizer_states", ()):
             by_muon = any("orthogonal" in group for group in state["param_groups"])
             expected = f"{'a number' if by_muon else 'null'}, as in {self.trainer.ckpt_path}"
             require(by_muon == (scale is not None), "optimizer.matrix_scale", expected, scale)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``.
-
-        Args:
-            checkpoint: of Lightning; gets the configuration and the names of weights that are
-                not trained."""
+        """Add the format's version, the configuration and the names of frozen weights to a checkpoint:
+        only plain data, so that it loads with ``torch.load(weights_only=True)``."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = self.config
         checkpoint["frozen"] = [name for name, p in self.named_parameters() if not p.requires_grad]

@@ -1,7 +1,7 @@
-"""Tokens of a frozen ViT on disk: of a photograph that is seen again they are read, not computed.
+"""Disk cache for the patch tokens of a frozen ViT: an image that occurs again is not encoded again.
 
-A file for each photograph, written whole, in a folder for each network and precision: several
-processes may share it, and one that was interrupted goes on with what is there."""
+Each image has one file, written atomically, in a folder per network and precision. Several processes
+may share the folder, and an interrupted run continues with the files that exist."""
 
 import hashlib
 import logging
@@ -31,39 +31,42 @@ log = logging.getLogger(__name__)
 
 
 class NoFeatureCache(Options):
-    """All tokens are computed in each step."""
+    """No cache: all tokens are computed in each step."""
 
     group = "feature_cache"
 
     def needs(self, model: nn.Module, data: PhotographsDataModule) -> None:
-        """Nothing."""
+        """Return None, as nothing is written."""
 
     def attach(self, model: nn.Module, data: PhotographsDataModule) -> None:
-        """Change nothing."""
+        """Leave the model unchanged."""
 
 
 class DiskFeatureCache(Options):
-    """Tokens of a frozen DINOv2 ViT are computed once for each photograph of training,
-    and kept on disk."""
+    """Tokens of a frozen DINOv2 ViT are computed once for each training image and cached on disk."""
 
     group = "feature_cache"
 
     folder: PathText | None = None
-    """Where; null: features, in $GHGS_CACHE or ~/.cache/ghgs_lit"""
+    """Folder of the cache; null: the folder features in $GHGS_CACHE, or in ~/.cache/ghgs_lit."""
     dtype: Literal["float16", "bfloat16"] = "float16"
-    """In which tokens are kept and used: float16 rounds to 11 bits, bfloat16 to 8"""
+    """Type in which tokens are stored and used: float16 has 11 significant bits, bfloat16 has 8."""
 
     def needs(self, model: nn.Module, data: PhotographsDataModule, network: str = "*") -> str:
-        """How much a training will write, in words.
+        """Describe how much a training will write, and check that the disk has room for it.
 
         Args:
-            model: as of :meth:`attach`; its weights are not read.
-            data: as of :meth:`attach`.
-            network: name of the network whose tokens count as written; ``*``: any.
+            model: as for :meth:`attach`; its weights are not read.
+            data: as for :meth:`attach`.
+            network: network whose tokens count as already written (:class:`FeatureCache`);
+                ``*``: any.
+
+        Returns:
+            One line for the log.
 
         Raises:
-            InputError: the encoder has no frozen ViT, the folder cannot be written,
-                or the disk has no room.
+            InputError: the encoder has no frozen ViT, the folder cannot be written to, or the disk has
+                too little space.
         """
         vit = getattr(getattr(model.encoder, "aggregator", None), "patch_embed", None)
         fits = isinstance(vit, VisionTransformer) and not any(p.requires_grad for p in vit.parameters())
@@ -72,7 +75,7 @@ class DiskFeatureCache(Options):
         if data.augmentation.changes_photographs:
             return "feature_cache: off, since augmentation makes a new photograph in each step"
         count = sum(map(len, data.subjects("train").values()))
-        patches = math.prod(-(-side // vit.patch_size) for side in data.dataset.size)  # some are padded
+        patches = math.prod(-(-side // vit.patch_size) for side in data.dataset.size)  # rounded up: padding
         size = count * patches * 2 * vit.pos_embed.shape[-1]
         files = self._root.glob(f"{network}-*-{self.dtype}/*/*.npy")
         there = sum(path.stat().st_size for path in files)
@@ -88,14 +91,14 @@ class DiskFeatureCache(Options):
         return Path(self.folder or shared / "features").expanduser()
 
     def attach(self, model: nn.Module, data: PhotographsDataModule) -> None:
-        """Let a model's encoder keep tokens in training, and log how much room they need.
+        """Make a model's encoder cache its tokens in training, and log how much space they take.
 
         Args:
-            model: whose encoder has its weights, and will not learn them.
-            data: of the training; where its augmentation changes photographs, nothing is kept.
+            model: model whose encoder has its final weights, which are not trained.
+            data: training data; if its augmentation changes images, nothing is cached.
 
         Raises:
-            InputError: as :meth:`needs`.
+            InputError: see :meth:`needs`.
         """
         text = self.needs(model, data)
         if not data.augmentation.changes_photographs:
@@ -109,37 +112,37 @@ class DiskFeatureCache(Options):
 
 
 class FeatureCache:
-    """Patch tokens by the content of a photograph.
+    """Cache of patch tokens, with the content of an image as key.
 
     Args:
-        folder: of all networks.
-        network: name of one, which depends on all of its weights.
-        dtype: float16 or bfloat16, in which tokens are kept. A photograph's are rounded to it when
-            they are computed, too, so that a training does not depend on which it found.
+        folder: folder of the caches of all networks.
+        network: name of the network, a digest of all its weights.
+        dtype: float16 or bfloat16, in which tokens are stored. Newly computed tokens are rounded to it,
+            too, so that results do not depend on which tokens were cached.
     """
 
     def __init__(self, folder: Path, network: str, dtype: torch.dtype) -> None:
         self.folder = folder
         self.network = network
         self.dtype = dtype
-        #: Photographs whose tokens were read, and those whose tokens were computed.
+        #: Number of images whose tokens were read, and of those whose tokens were computed.
         self.read = self.computed = 0
 
     @torch.no_grad()
     def __call__(
         self, compute: Callable[[Tensor], Tensor], images: Float[Tensor, "n i H W"]
     ) -> Float[Tensor, "n p c"]:
-        """Tokens of all patches.
+        """Read the tokens of images, and compute those that are missing.
 
         Args:
-            compute: images [m, i, H, W] to tokens [m, p, c].
-            images: as the network sees them.
+            compute: function from images [m, i, H, W] to tokens [m, p, c].
+            images: the network's input.
 
         Returns:
-            Tokens [n, p, c] of the images' dtype and device.
+            Tokens [n, p, c] with the images' dtype and device.
 
         Raises:
-            InputError: a token is too large for ``dtype``.
+            InputError: a token overflows ``dtype``.
             OSError: the disk is full.
         """
         paths = [self._path(image, images.device) for image in images.detach().cpu()]
@@ -159,10 +162,10 @@ class FeatureCache:
         return result.view(self.dtype).to(images.device, non_blocking=True).to(images.dtype)
 
     def place(self, device: torch.device) -> Path:
-        """The folder of this network, as its products round on a device now.
+        """Folder of this network and of the present precision of matrix products.
 
         Args:
-            device: that computes tokens.
+            device: device that computes tokens.
         """
         kind = device.type
         rounding = "tf32" if rounds_products(kind) else "float32"
@@ -171,12 +174,7 @@ class FeatureCache:
         return self.folder / f"{self.network}-{rounding}-{str(self.dtype).removeprefix('torch.')}"
 
     def _path(self, image: Tensor, device: torch.device) -> Path:
-        """The file of an image, by its content and shape.
-
-        Args:
-            image: on the CPU.
-            device: that computes its tokens.
-        """
+        """File of an image on the CPU, named by its dtype, shape and content."""
         digest = hashlib.sha256(f"{image.dtype} {tuple(image.shape)};".encode())
         digest.update(image.contiguous().numpy())
         name = digest.hexdigest()[:32]
@@ -184,7 +182,7 @@ class FeatureCache:
 
 
 def _mapped(path: Path) -> np.ndarray | None:
-    """Tokens [p, c] of a file, as integers of 16 bits; None: there is none, or it is damaged."""
+    """Tokens [p, c] of a file, memory-mapped as int16; None if it is missing or damaged."""
     try:
         return np.load(path, mmap_mode="r")
     except (FileNotFoundError, ValueError, EOFError):
@@ -192,5 +190,5 @@ def _mapped(path: Path) -> np.ndarray | None:
 
 
 def _write(values: np.ndarray, path: Path) -> None:
-    with path.open("wb") as stream:  # NumPy would add a suffix to a name
+    with path.open("wb") as stream:  # given a path, NumPy would append .npy
         np.save(stream, values)

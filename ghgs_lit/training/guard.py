@@ -1,5 +1,5 @@
-"""Guard against training steps that are not finite: their stage is named, their batch saved, and they
-are skipped."""
+"""Guard against training steps with values that are not finite: finds the stage, saves the batch, and
+skips the step."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from ghgs_lit.runtime.watching import Inputs, Watcher, watched
 from ghgs_lit.training.optimization import named_weights
 from ghgs_lit.types import Batch, map_tensors
 
-#: Dotted paths of the stages that faults are assigned to.
+#: Dotted paths of the stages to which faults are attributed.
 _STAGES = {name: f"model.{name}" for name in (*STAGES, "rounds")} | {
     "renderer": "renderer",
     "losses": "losses",
 }
-#: Batches that a run saves at most.
+#: Maximum number of batches that a run saves.
 _SAVED = 10
 
 
@@ -36,9 +36,9 @@ class Step:
     """All inputs of a forward pass except the weights.
 
     Args:
-        batch: of this process.
-        seed: of all random numbers of the step.
-        budget: which patches the encoder sees (:func:`~ghgs_lit.training.module.drawn_budget`);
+        batch: the batch of this process.
+        seed: seed of all random numbers of the step.
+        budget: which patches the encoder processes (:func:`~ghgs_lit.training.module.drawn_budget`);
             None: as configured.
         rounds: number of rounds; None: sampled with the seed."""
 
@@ -49,13 +49,13 @@ class Step:
 
 
 class _FirstFault(Watcher):
-    """The first values that are not finite, in words; "" where there are none."""
+    """Describes the first values that are not finite in ``text``; "": all are finite."""
 
     def __init__(self) -> None:
         self.text = ""
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
-        """Views of the inputs, whose gradients come from this stage alone."""
+        """Replace inputs by views, so that their gradients come from this stage alone."""
 
         def view(value: Tensor) -> Tensor:
             if not value.requires_grad:
@@ -70,7 +70,7 @@ class _FirstFault(Watcher):
         self.check(f"result of {stage}", result)
 
     def check(self, place: str, value: Any) -> None:
-        """Note a value in which numbers are not finite, unless another was noted before."""
+        """Describe the values of ``place`` that are not finite, unless a fault was found before."""
 
         def check(tensor: Tensor) -> Tensor:
             broken = int((~tensor.isfinite()).sum())
@@ -82,17 +82,17 @@ class _FirstFault(Watcher):
 
 
 def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> str:
-    """Run a step again, and find the first values that are not finite in weights, batch, results of
-    stages, and gradients. Weights and their gradients are not changed.
+    """Repeat a step, and find the first values that are not finite in weights, batch, results of stages
+    and gradients. Weights and their gradients are not changed.
 
     Args:
-        module: with ``model``, ``renderer``, ``losses`` and ``forward_losses``, as
+        module: module with ``model``, ``renderer``, ``losses`` and ``forward_losses``, such as
             :class:`~ghgs_lit.training.module.GHGSModule`.
-        step: the inputs.
+        step: inputs of the step.
         scale: factor of the loss (``16-mixed``).
 
     Returns:
-        How many values of what; "": all are finite."""
+        The number of such values and their place, in words; "": all are finite."""
     fault = _FirstFault()
     trained = {}
     for name, weight in named_weights(module):
@@ -115,11 +115,12 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
 
 
 class Guard:
-    """Checks each step of the optimizer, and runs the step again only if it is not finite. All
-    processes decide alike. The inputs of the step are saved to ``<run>/faults/step_<n>.pt``.
+    """Checks that the loss and the gradient of each step are finite. A step that is not is repeated to
+    find the fault, its inputs are saved to ``<run>/faults/step_<n>.pt``, and it is skipped. All
+    processes make the same decision.
 
     Args:
-        limit: steps in a row that are skipped before the run stops.
+        limit: maximum number of consecutive steps that are skipped before the run stops.
 
     Attributes:
         skipped: number of steps skipped in all sessions of the run."""
@@ -131,23 +132,24 @@ class Guard:
         self._steps: list[tuple[Step, Tensor]] = []
 
     def note(self, step: Step, loss: Tensor) -> None:
-        """Store a forward pass of the optimizer's next step; does not synchronise with the device.
+        """Store a forward pass of the optimizer's next step, without a synchronisation.
 
         Args:
-            step: its inputs.
-            loss: its total loss, without dimensions."""
+            step: inputs of the forward pass.
+            loss: its total loss, a scalar."""
         self._steps.append((step, loss.detach()))
 
     def is_finite(self, trainer: L.Trainer, norm: Tensor) -> tuple[bool, bool]:
-        """Check the next step of the optimizer. A training step synchronises with the device only here.
+        """Check the next step of the optimizer. This is a training step's only device-to-host
+        synchronisation.
 
         Args:
-            trainer: of the run.
-            norm: of the gradient, without dimensions.
+            trainer: the run's Trainer.
+            norm: norm of the gradient, a scalar.
 
         Returns:
-            Whether all losses since the last step, and whether the norm,
-            are finite in all processes."""
+            Whether all losses since the last step are finite in all processes, and whether the norm
+            is."""
         losses = torch.stack([loss for _, loss in self._steps]) if self._steps else norm.new_zeros(1)
         flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
         if trainer.world_size > 1:
@@ -156,20 +158,19 @@ class Guard:
         return bool(losses_hold), bool(norm_holds)
 
     def accept(self) -> None:
-        """Note that the step was finite, or that a scaler of the loss skips it."""
+        """Accept the step: it is finite, or the gradient scaler skips it."""
         self._steps.clear()
         self._in_a_row = 0
 
     def refuse(self, module: L.LightningModule, scale: float) -> None:
-        """Explain and save the fault, and drop the gradients,
-        so that the optimizer changes nothing.
+        """Find and save the fault, and remove the gradients, so that the optimizer changes nothing.
 
         Args:
-            module: that of :func:`first_fault`.
+            module: see :func:`first_fault`.
             scale: factor of the loss.
 
         Raises:
-            DivergedError: more than ``limit`` steps in a row were not finite."""
+            DivergedError: more than ``limit`` consecutive steps were not finite."""
         trainer = module.trainer
         faults = [self._explain(module, scale)]
         self._steps.clear()
@@ -188,7 +189,7 @@ class Guard:
             print(f"{message}; the step is skipped", flush=True)
 
     def _explain(self, module: L.LightningModule, scale: float) -> str:
-        """The first fault of this process, "" if none, and the file that has its batch."""
+        """Describe the first fault of this process, and name the file with its batch; "": no fault."""
         for step, _ in self._steps:
             if not (fault := first_fault(module, step, scale)):
                 continue

@@ -1,4 +1,4 @@
-"""Loggers that continue after a restart, and the values by which runs are compared."""
+"""Loggers that continue after a restart, and the values logged for the comparison of runs."""
 
 import os
 import warnings
@@ -17,26 +17,22 @@ from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
 from ghgs_lit.runs.run import RunDirectory
 
-#: Values of the measurement by which runs are compared; ``metrics.json`` has all.
+#: Metrics by which runs are compared; ``metrics.json`` contains all.
 COMPARED = ("psnr", "ssim", "depth_error_mm")
-#: Number of input views at which HParams compares runs, of those that were measured at several.
+#: Number of input views at which HParams compares runs that were measured with several numbers.
 _VIEWS = 4
-#: Groups of tags that TensorBoard shows first: it sorts them by name.
+#: Groups of tags that TensorBoard shows first; it sorts groups by name, so others move to ``work/``.
 _FIRST = ("loss", "measured", "val", "values", "view")
-#: Settings that compare runs even where all have the same.
+#: Settings that are always logged as hyperparameters.
 _ALWAYS = ("seed", "views")
 Value = str | int | float | bool
 
 
 class _StepsTaken:
-    """Counts steps taken, as checkpoints and pictures do; for Lightning the first step is 0."""
+    """Logs at the number of steps taken, as checkpoints and pictures do; Lightning counts from 0."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log values.
-
-        Args:
-            metrics: values by name.
-            step: of Lightning, one less than the number of steps taken."""
+        """Log values by name; ``step`` is Lightning's, one less than the number of steps taken."""
         super().log_metrics(metrics, None if step is None else step + 1)
 
 
@@ -44,18 +40,18 @@ class CsvLog(_StepsTaken, CSVLogger):
     """Lightning's ``metrics.csv``, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Keep the rows of earlier steps, as later ones are trained again.
+        """Remove rows of later steps, which are trained again.
 
         Args:
-            step: number of steps taken, from where the run goes on."""
+            step: number of steps taken at which the run continues."""
         path = Path(self.log_dir) / "metrics.csv"
         rows = read_rows(path) if path.is_file() else []
         # A killed run may have left an incomplete last line.
         rows = [row for row in rows if (row.get("step") or "").isdecimal() and int(row["step"]) <= step]
         with warnings.catch_warnings():
-            # the rows are written again below
+            # The rows are written again below.
             warnings.filterwarnings("ignore", ".*will be deleted")
-            writer = self.experiment  # starts with an empty file
+            writer = self.experiment  # creates an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()
 
@@ -64,10 +60,10 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
     """TensorBoard's event files, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Drop what was logged later, from the files, and from a TensorBoard that has read them.
+        """Remove later events from the files, and from a TensorBoard that has already read them.
 
         Args:
-            step: number of steps taken, from where the run goes on."""
+            step: number of steps taken at which the run continues."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         for path in sorted(Path(self.log_dir).glob("events.out.tfevents.*")):
@@ -76,11 +72,11 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log without the epoch that Lightning adds. A killed process loses nothing that it logged.
+        """Log values without Lightning's epoch, and flush, so that a killed process loses none.
 
         Args:
-            metrics: values by name; what is no loss or validation comes below ``work/``.
-            step: of Lightning."""
+            metrics: values by tag; tags of other groups than :data:`_FIRST` are prefixed with ``work/``.
+            step: Lightning's step."""
         shown = {}
         for name, value in metrics.items():
             is_first = name.split("/")[0] in _FIRST
@@ -91,7 +87,7 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
 
 
 def _drop_events_after(path: Path, step: int) -> None:
-    """Write a file of events again without those after a step."""
+    """Rewrite a file of events without those after ``step``."""
     from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.summary.writer.record_writer import RecordWriter
@@ -110,40 +106,42 @@ class CsvOptions(Options):
     """Logged values in ``<run>/csv/metrics.csv``."""
 
     def build(self, save_dir: str) -> CsvLog:
-        """The logger of the run in ``save_dir``."""
+        """Create the logger of the run in ``save_dir``."""
         return CsvLog(save_dir, name="csv", version="", flush_logs_every_n_steps=1)
 
 
 class TensorBoardOptions(Options):
-    """TensorBoard's files in ``<run>/tensorboard``; of a run of a grid in
-    ``<sweep>/tb/<what sets it apart>``, since TensorBoard names runs by their folders."""
+    """TensorBoard's event files in ``<run>/tensorboard``; for a run of a sweep in
+    ``<sweep>/tb/<its settings>``, as TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
-        """The logger of the run in ``save_dir``."""
+        """Create the logger of the run in ``save_dir``."""
         return TensorBoardLog(RunDirectory(Path(save_dir)).curves, name="", version="")
 
 
 class WandbLog(WandbLogger):
-    """Weights & Biases: one run there for each run here,
-    however often it is interrupted or moved."""
+    """Weights & Biases logger: one W&B run per run, however often it is interrupted or moved."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log at the number of steps taken, by which steps that are trained again replace nothing.
+        """Log values at the number of steps taken. Steps that are trained again do not replace values.
 
         Args:
             metrics: values by name.
-            step: of Lightning."""
+            step: Lightning's step, one less than the number of steps taken."""
         taken = None if step is None else step + 1
         self.experiment.log({**metrics, "trainer/global_step": taken}, step=taken)
 
 
 class WandbOptions(Options):
-    """Weights & Biases (extra ``wandb``); ``WANDB_PROJECT`` and ``WANDB_MODE`` of the
-    environment count."""
+    """Weights & Biases (extra ``wandb``), configured by the environment variables ``WANDB_PROJECT`` and
+    ``WANDB_MODE``."""
 
     def build(self, save_dir: str) -> WandbLog:
-        """The logger of the run in ``save_dir``; InputError: the extra is not installed."""
+        """Create the logger of the run in ``save_dir``.
+
+        Raises:
+            InputError: the extra is not installed."""
         installed("wandb", "wandb", "logger.wandb")
         project = os.environ.get("WANDB_PROJECT", "ghgs_lit")
         identity = RunDirectory(Path(save_dir)).marker
@@ -152,12 +150,12 @@ class WandbOptions(Options):
 
 @rank_zero_only
 def begin(loggers: Sequence[Logger], config: str, step: int | None) -> None:
-    """Begin the logs of a run, or continue those in the same folder.
+    """Begin the logs of a run, or continue those in its folder.
 
     Args:
-        loggers: of the run.
-        config: its resolved configuration as YAML, for the tab Text of TensorBoard.
-        step: number of steps taken, from where it goes on; None: a new run."""
+        loggers: the run's loggers.
+        config: the resolved configuration as YAML, for TensorBoard's Text tab.
+        step: number of steps taken at which the run continues; None: a new run."""
     for logger in loggers:
         if step is not None and isinstance(logger, (CsvLog, TensorBoardLog)):
             logger.resume(step)
@@ -173,18 +171,19 @@ def log_results(
     table: str,
     step: int,
 ) -> None:
-    """Log what sets a run apart, which CSV has in ``config.yaml``, and its final numbers.
+    """Log a run's hyperparameters and final metrics. CSV gets no hyperparameters: ``config.yaml`` has
+    them.
 
     Args:
-        loggers: of the run.
-        values: of :func:`hyperparameters`.
-        summary: of ``metrics.json``.
-        table: the same in Markdown.
+        loggers: the run's loggers.
+        values: hyperparameters, from :func:`hyperparameters`.
+        summary: rows of ``metrics.json``, one per protocol.
+        table: the summary as a Markdown table.
         step: number of steps after which the weights were measured."""
     for logger in loggers:
         rows = summary
         if isinstance(logger, TensorBoardLog):
-            # Its tab HParams compares runs at one number of views, its tab Text has the whole measurement.
+            # The HParams tab compares runs at one number of views, the Text tab shows the whole table.
             rows = [next((row for row in summary if row["views"] == _VIEWS), summary[0])]
             for part in hparams(dict(values), final_numbers(rows)):
                 logger.experiment._get_file_writer().add_summary(part)
@@ -196,12 +195,9 @@ def log_results(
 
 
 def close(loggers: Sequence[Logger]) -> None:
-    """Write remaining values and end the loggers' threads, since runs of a sweep share a process.
-
-    Args:
-        loggers: of a run that has ended."""
+    """Flush the loggers of a finished run and end their threads, as runs of a sweep share a process."""
     for logger in loggers:
-        # Unused loggers must not start now.
+        # Reading ``experiment`` would start loggers that were never used.
         if isinstance(logger, TensorBoardLogger) and logger._experiment is not None:
             logger._experiment.close()
         elif isinstance(logger, WandbLogger) and logger._experiment is not None:
@@ -209,13 +205,13 @@ def close(loggers: Sequence[Logger]) -> None:
 
 
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Values by which runs are compared.
+    """Metrics by which runs are compared (:data:`COMPARED`).
 
     Args:
-        summary: of ``metrics.json``, a row for each protocol.
+        summary: rows of ``metrics.json``, one per protocol.
 
     Returns:
-        Such as ``measured/psnr_v4_release``; only defined values."""
+        Values by tags such as ``measured/psnr_v4_release``, without undefined ones."""
     numbers = {}
     for row in summary:
         for name in COMPARED:
@@ -227,16 +223,16 @@ def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def hyperparameters(
     config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str]
 ) -> dict[str, Value]:
-    """Settings by which runs are compared: what ``overrides`` set, seed and views. Keys that do not
-    affect results are left out.
+    """Settings by which runs are compared: those of ``overrides``, the seed and the number of views,
+    without keys that do not affect results.
 
     Args:
-        config: the run's.
-        choices: the option of each config group.
-        overrides: of a run of a grid those that set it apart, else all.
+        config: the run's configuration.
+        choices: the selected option of each config group.
+        overrides: for a run of a sweep those that distinguish it, otherwise all.
 
     Returns:
-        Values by key; those that are no plain value as text."""
+        Values by key; lists and dicts are converted to text."""
     found: dict[str, Value] = {}
     for key in dict.fromkeys([*map(key_of, overrides), *_ALWAYS]):
         value = choices[key] if key in choices else lookup(config, key)

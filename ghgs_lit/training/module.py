@@ -1,4 +1,4 @@
-"""The LightningModule of training: steps and logging around the model."""
+"""LightningModule of training: training and validation steps, and logging."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -28,7 +28,7 @@ from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Ren
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
 Choice = TypeVar("Choice")
-#: Metrics of validations, as the run's protocol defines them; LPIPS where it has one.
+#: Metrics of validations, as the run's protocol defines them; LPIPS only where it is available.
 VALIDATED = ("psnr", "psnr_box", "ssim", "lpips", *FURTHER, "psnr_edge")
 
 
@@ -37,51 +37,44 @@ def drawn_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int 
 
     Args:
         budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest
-            rectangle that holds the subject (``balanced``); a number: the subject's patches and
-            those at most this many patches away (``fast``). Budgets that are listed twice are
-            sampled twice as often.
+            rectangle around the subject (``balanced``); a number: the subject's patches and those at
+            most this many patches away (``fast``). A budget listed twice is sampled twice as often.
         numbers: seed; equal numbers give the same budget.
-        stream: another one gives other samples for the same numbers.
+        stream: selects an independent stream of samples for the same seed.
 
     Returns:
         One of the budgets."""
-    # A separate key: the same numbers seed the other samples of the step.
+    # A key of its own, as the same numbers also seed other samples of the step.
     generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(stream,)))
     return budgets[int(generator.integers(len(budgets)))]
 
 
 def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
-    """Set which patches the encoder processes while the context lasts.
+    """Context in which the encoder processes the patches of a budget.
 
     Args:
-        model: that predicts in the context.
-        budget: of :func:`drawn_budget`; None: as the model is configured.
-
-    Returns:
-        The context."""
+        model: the model whose encoder is set.
+        budget: see :func:`drawn_budget`; None: as the model is configured."""
     return nullcontext() if budget is None else seeing(model.encoder, KeptTokens.of_budget(budget))
 
 
 def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[None]:
-    """Set the number of rounds of a training step while the context lasts.
+    """Context in which the model predicts with a given number of rounds.
 
     Args:
-        model: that predicts in the context.
-        count: the number; None: each prediction samples one.
-
-    Returns:
-        The context."""
+        model: the model whose rounds are set.
+        count: number of rounds; None: each prediction samples one."""
     return nullcontext() if count is None else model.rounds.drawn(count)
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
-    """Mean error of predicted depths of subjects in mm."""
+    """Mean error of predicted depths in mm, over valid pixels of the subjects."""
     valid = batch.masks & maps.valid
     return depth_error_mm(maps.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1))
 
 
 def _surface_error(batch: Batch, gaussians: Gaussians) -> Tensor:
-    """Mean distance of Gaussians and true surfaces in mm, over the batch."""
+    """Mean distance between Gaussians and true surfaces in mm, over the batch."""
     errors = []
     for element, surface in enumerate(seen_surfaces(batch)):
         own = gaussians[element]
@@ -90,20 +83,21 @@ def _surface_error(batch: Batch, gaussians: Gaussians) -> Tensor:
 
 
 class GHGSModule(BudgetedModule):
-    """Trains a model through a renderer.
+    """Trains a model through a differentiable renderer.
 
     Args:
-        model: as of :class:`BudgetedModule`.
+        model: see :class:`BudgetedModule`.
         renderer: renders Gaussians from cameras.
-        losses: gives the weighted total, and each term by name, of a prediction, its rendering and
-            the batch. Weights of its own are trained with the model's.
-        optimization: as of :class:`BudgetedModule`.
-        config: as of :class:`BudgetedModule`.
-        token_budgets: budgets for :func:`drawn_budget` in each training step; None: as configured.
+        losses: computes the weighted total and the terms by name from a prediction, its rendering and
+            the batch. Its weights, if any, are trained with the model's.
+        optimization: see :class:`BudgetedModule`.
+        config: see :class:`BudgetedModule`.
+        token_budgets: budgets from which each training step samples (:func:`drawn_budget`); None: as
+            the model is configured.
 
     Attributes:
-        metrics: the protocol of validations, which measure :data:`VALIDATED`, on the device of the
-            training; at first without LPIPS."""
+        metrics: the protocol by which validations measure :data:`VALIDATED`, on the training device;
+            initially without LPIPS."""
 
     def __init__(
         self,
@@ -122,7 +116,7 @@ class GHGSModule(BudgetedModule):
         self.metrics = MetricsOptions(lpips="off").build()
         self.means = nn.ModuleDict({name: image_mean() for name in VALIDATED})
         model.keeps_drafts = True  # validation measures each round
-        #: What gives the model its batches; None: the model is no :class:`GHGS` and takes them itself.
+        #: Prepares batches for the model; None: the model is not a :class:`GHGS` and takes them directly.
         self.predictor = Predictor(model) if isinstance(model, GHGS) else None
         self.captured_step = self.predictor and CapturedStep(self.predictor, renderer, losses)
 
@@ -130,13 +124,13 @@ class GHGSModule(BudgetedModule):
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> "GHGSModule":
-        """The module of a checkpoint of ``ghgs train`` or of any Trainer.
+        """Load a module from a checkpoint of ``ghgs train`` or of any Trainer.
 
         Args:
             checkpoint_path: the file.
             map_location: device of the weights; None: the CPU.
-            **parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the
-                configuration. A part with weights gets those of the checkpoint.
+            **parts: ``renderer``, ``losses`` and ``optimization`` that replace the configured ones.
+                Their weights, if any, are loaded from the checkpoint.
 
         Returns:
             The module, in training mode.
@@ -150,31 +144,21 @@ class GHGSModule(BudgetedModule):
                 place = f"{checkpoint_path}: config.{group}"
                 require(group in config, place, f"options of it, or {name}=...", "nothing")
                 parts[name] = build(config[group], group)
-            if state := model_state(checkpoint, f"{name}."):  # a loss with weights of its own
+            if state := model_state(checkpoint, f"{name}."):  # e.g. a loss with trained weights
                 load_strictly(parts[name], state, checkpoint_path)
         model = Predictor.from_checkpoint(checkpoint_path, map_location or "cpu").model
         return cls(model.train(), config=config, **parts)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
-        """Predict and render.
-
-        Args:
-            batch: with targets.
-
-        Returns:
-            The prediction for the batch, and its Gaussians rendered from the batch's
-            target cameras."""
+        """Predict Gaussians for a batch with targets, and render them from its target cameras."""
         prediction = (self.predictor or self.model)(batch)
         return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
-        """Run the forward pass of a step, with the random numbers of its seed.
-
-        Args:
-            step: the inputs.
+        """Run the forward pass of a step, with random numbers from its seed.
 
         Returns:
-            The prediction, its loss without dimensions, and the loss's unweighted terms by name."""
+            The prediction, the scalar loss, and the unweighted terms of the loss by name."""
         torch.manual_seed(step.seed)
         with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
             prediction, rendering = self(step.batch)
@@ -182,12 +166,12 @@ class GHGSModule(BudgetedModule):
         return prediction, total, values
 
     def _called(self, step: Step) -> Outcome:
-        """The forward pass of a step, operator by operator."""
+        """Run the forward pass of a step eagerly."""
         prediction, total, values = self.forward_losses(step)
         return Outcome(total, values, len(prediction.gaussians))
 
     def _captured(self, step: Step) -> Outcome | None:
-        """The forward pass of a step, captured; None where it must be called eagerly."""
+        """Run the forward pass of a step with CUDA-graph capture; None: it must run eagerly."""
         captured = self.captured_step
         scaler = self._scaler
         if captured is None or not captured.captures(step.batch, scaler is not None):
@@ -198,10 +182,10 @@ class GHGSModule(BudgetedModule):
             return captured(step.batch, scale)
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:
-        """All inputs of a training step."""
+        """Assemble all inputs of a training step."""
         budget = count = None
         shared = self.class_numbers(batch_idx)
-        # the same in all processes, so that none waits for another
+        # Equal in all processes, so that none waits for another.
         if self.token_budgets is not None:
             budget = drawn_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
         if shared and isinstance(getattr(self.model, "rounds", None), Rounds):
@@ -209,14 +193,11 @@ class GHGSModule(BudgetedModule):
         return Step(batch, self.step_seed(batch_idx), budget, count)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Run a step and log its loss, without a wait for the device.
-
-        Args:
-            batch: with targets.
-            batch_idx: of Lightning.
+        """Run the forward pass of a step on a batch with targets and log its loss, without a
+        synchronisation.
 
         Returns:
-            The total loss, without dimensions."""
+            The total loss, a scalar."""
         step = self._step(batch, batch_idx)
         total, values, gaussians = self._captured(step) or self._called(step)
         self.guard.note(step, total)
@@ -228,11 +209,7 @@ class GHGSModule(BudgetedModule):
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """Predict, render and measure.
-
-        Args:
-            batch: with targets.
-            batch_idx: not used.
+        """Predict, render and measure a batch with targets.
 
         Returns:
             ``prediction`` and ``rendering``, for callbacks."""
@@ -256,7 +233,7 @@ class GHGSModule(BudgetedModule):
     def _measured(
         self, image: Float[Tensor, "b t 3 h w"], targets: Targets, names: Sequence[str]
     ) -> dict[str, Tensor]:
-        """Values of each target view [b * t] by name, without LPIPS where the protocol has none."""
+        """Metrics of each target view, [b * t], by name; without LPIPS where it is not available."""
         known = [name for name in names if name != "lpips" or self.metrics.lpips is not None]
         flat = (values.flatten(0, 1) for values in (image, targets.images, targets.masks))
         depths = None if targets.depths is None else targets.depths.flatten(0, 1)
@@ -275,17 +252,14 @@ class GHGSModule(BudgetedModule):
         return values
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip the gradients of all weights to ``optimizer.clip`` and log their norm before.
+        """Clip the gradients of all weights to a norm of ``optimizer.clip``, and log their norm before.
 
-        Gradients are already unscaled. After an overflow, a scaler of the loss skips the step and
-        halves its factor; the guard handles losses that are not finite, and gradients that overflow
-        without a factor.
-
-        Args:
-            optimizer, gradient_clip_val, gradient_clip_algorithm: of Lightning; not used.
+        Gradients are already unscaled, and Lightning's arguments are not used. After an overflow, the
+        gradient scaler skips the step and halves its factor. The guard handles losses that are not
+        finite, and gradients that overflow with a factor of at most 1.
 
         Raises:
-            DivergedError: the guard does not skip the step."""
+            DivergedError: the step is not finite, and the guard does not skip it."""
         self.optimization.drop_frozen_gradients(self, self.used_budget)
         norm = self.optimization.clip_gradients(self)
         loss_holds, norm_holds = self.guard.is_finite(self.trainer, norm)
@@ -299,14 +273,14 @@ class GHGSModule(BudgetedModule):
         self.guard.accept()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the number of skipped steps and shape buckets to what :class:`BudgetedModule` adds."""
+        """Add the number of skipped steps and the shape buckets of captured steps."""
         super().on_save_checkpoint(checkpoint)
         checkpoint["skipped_steps"] = self.guard.skipped
         if self.captured_step is not None:
             checkpoint["shape_buckets"] = self.captured_step.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on counting skipped steps, and with the same shape buckets."""
+        """Restore the number of skipped steps and the shape buckets."""
         super().on_load_checkpoint(checkpoint)
         self.guard.skipped = checkpoint.get("skipped_steps", 0)
         if self.captured_step is not None:

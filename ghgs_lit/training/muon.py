@@ -1,14 +1,14 @@
-"""Muon: orthogonal steps for matrices, AdamW for everything else.
+"""Muon: orthogonal steps for matrices, AdamW for all other parameters.
 
-Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/KellerJordan/Muon):
-they change all directions of a matrix equally, not only the few that dominate the gradient. Step
-lengths are those of J. Liu et al., "Muon is Scalable for LLM Training", 2025.
+Muon orthogonalises the step of a matrix (K. Jordan et al., 2024, github.com/KellerJordan/Muon), so
+that it changes all directions equally, not only the few that dominate the gradient. Step lengths
+follow J. Liu et al., "Muon is Scalable for LLM Training", 2025.
 
-``torch.optim.Muon`` takes the same steps, one matrix after the other, in bfloat16, and rejects
-weights of convolutions. Here these are matrices with a row for each output channel, products are
-float32, and matrices of similar size are multiplied together. Of the 134 matrices of the weights
-that come with the package, PyTorch's takes 61, for which it launches 1 403 kernels; this module
-launches 133 for all weights."""
+``torch.optim.Muon`` takes the same steps matrix by matrix, in bfloat16, and rejects weights of
+convolutions. Here these are matrices with one row per output channel, products are float32, and
+matrices of similar size are multiplied in one batch. Of the 134 matrices of the weights that come with
+the package, PyTorch's Muon accepts 61, for which it launches 1 403 kernels; this module launches 133
+for all weights."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, partial
@@ -19,30 +19,24 @@ from torch import Tensor, nn
 
 from ghgs_lit.execution.graphs import GraphCache
 
-#: Newton-Schulz: odd polynomials that take singular values in (0, 1] close to 1 (Jordan et al.).
+#: Newton-Schulz iteration: an odd polynomial that moves singular values in (0, 1] close to 1 (Jordan
+#: et al.).
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ITERATIONS = 5
 MOMENTUM = 0.95
 #: Approximate root mean square of AdamW's steps (Liu et al., section 2.2).
 ROOT_MEAN_SQUARE = 0.2
-#: Parameters with fewer rows or columns (tokens, biases, heads of one or two channels) are
-#: left to AdamW.
+#: Parameters with fewer rows or columns (tokens, biases, heads with one or two channels) use AdamW.
 SMALLEST_SIDE = 3
-#: Matrices whose smaller side has at most so many rows are padded to powers of two,
-#: and share products.
+#: Matrices with a smaller side of at most this size are padded to powers of two and share products.
 PADDED_SIDE = 128
 #: Smallest side of padded matrices.
 LEAST_PADDED = 16
 
 
 def is_matrix(parameter: nn.Parameter) -> bool:
-    """Whether Muon moves a parameter.
-
-    Args:
-        parameter: of any shape; the first dimension of a convolution's weight counts as rows.
-
-    Returns:
-        True for matrices, and weights of convolutions, with at least 3 rows and 3 columns."""
+    """Whether Muon updates a parameter: a matrix, or the weight of a convolution with its first
+    dimension as rows, that has at least 3 rows and 3 columns."""
     if parameter.dim() < 2:
         return False
     rows = parameter.shape[0]
@@ -50,18 +44,17 @@ def is_matrix(parameter: nn.Parameter) -> bool:
 
 
 def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
-    """Replace singular values by values of about 1 (0.7 to 1.2).
+    """Orthogonalise matrices approximately: replace their singular values by values of 0.7 to 1.2.
 
-    Zeros around a matrix change none of its singular vectors, so that small matrices of many sizes
-    are padded and go through the iterations together. A result depends, within rounding, on
-    the other matrices.
+    Padding with zeros does not change singular vectors, so small matrices of many sizes are padded and
+    share the iterations. A result depends, within rounding, on the other matrices.
 
     Args:
-        matrices: of any sizes, float32 or wider, all of one type on one device.
+        matrices: matrices of any sizes, float32 or wider, with one dtype and device.
 
     Returns:
-        A matrix of the same size for each. Singular values below 1e-3 of a matrix's largest become
-        less than 1; zeros stay 0."""
+        Matrices of the same sizes. Singular values below 1e-3 of a matrix's largest one become less
+        than 1; zeros stay 0."""
     results = list(matrices)
     small = []
     by_shape: dict[torch.Size, list[int]] = {}
@@ -81,7 +74,7 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _small(matrices: list[Tensor]) -> list[Tensor]:
-    """:func:`orthogonalized` of matrices with a side of at most :data:`PADDED_SIDE`."""
+    """Orthogonalise matrices with a side of at most :data:`PADDED_SIDE`."""
     packing = _packing(tuple(tuple(matrix.shape) for matrix in matrices), matrices[0].device)
     values = torch.cat([*(matrix.reshape(-1) for matrix in matrices), matrices[0].new_zeros(1)])
     products = []
@@ -94,12 +87,12 @@ def _small(matrices: list[Tensor]) -> list[Tensor]:
 
 
 class _Packing(NamedTuple):
-    """Where values of matrices lie in padded ones.
+    """Indices that map matrices to padded matrices, and back.
 
     Args:
-        places: for each size, [n, rows, columns] with the place of each value in all matrices one
-            after the other, and the place behind the last one for zeros.
-        back: the place of each value in all padded matrices one after the other."""
+        places: for each padded size, [n, rows, columns] with the index of each value in the
+            concatenated matrices; the index after the last one is for padding zeros.
+        back: index of each value in the concatenated padded matrices."""
 
     places: tuple[Tensor, ...]
     back: Tensor
@@ -107,7 +100,7 @@ class _Packing(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _packing(shapes: tuple[tuple[int, int], ...], device: torch.device) -> _Packing:
-    """The packing of matrices of these shapes, which are the same in almost all steps."""
+    """Compute the packing of matrices; cached, as shapes are the same in almost all steps."""
     classes: dict[tuple[int, int], list[Tensor]] = {}
     first = 0
     for shape in shapes:
@@ -115,7 +108,7 @@ def _packing(shapes: tuple[tuple[int, int], ...], device: torch.device) -> _Pack
         first += places.numel()
         wide = places if shape[0] <= shape[1] else places.mT
         side = max(_power_of_two(wide.shape[0]), LEAST_PADDED)
-        # On a CPU padding costs time, on a GPU the number of products.
+        # On a CPU the cost is padding, on a GPU it is the number of products.
         width = _power_of_two(wide.shape[1]) if device.type == "cpu" else 0
         classes.setdefault((side, width), []).append(wide)
     padded = []
@@ -132,25 +125,25 @@ def _packing(shapes: tuple[tuple[int, int], ...], device: torch.device) -> _Pack
 
 
 def _power_of_two(count: int) -> int:
-    """The smallest power of two that is not below ``count``."""
+    """The smallest power of two that is at least ``count``."""
     return 1 << (count - 1).bit_length()
 
 
 def _orthogonalized(matrices: Tensor) -> Tensor:
-    """:func:`orthogonalized` of matrices [n, R, C], by polynomials of the smaller Gram matrices."""
+    """Orthogonalise matrices [n, R, C] by polynomials of the smaller Gram matrices."""
     if matrices.shape[1] > matrices.shape[2]:
         return _orthogonalized(matrices.mT).mT
     a, b, c = COEFFICIENTS
     largest = torch.linalg.vector_norm(matrices, torch.inf, dim=(1, 2), keepdim=True)
-    # no square underflows
+    # Prevents an underflow of squares.
     matrices = matrices / largest.clamp(min=torch.finfo(matrices.dtype).tiny)
     gram = matrices @ matrices.mT
     square = gram.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]  # squared Frobenius norms
-    square = square.clamp(min=1)  # below it only for zeros, as the largest value is 1
+    square = square.clamp(min=1)  # less only for zeros, as the largest value is 1
     gram = gram / square
     factor = square.rsqrt() * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     for iteration in range(ITERATIONS):
-        # The polynomial is a + rest; a is added by the products.
+        # The polynomial is a + rest; baddbmm adds the part with a.
         rest = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
         factor = torch.baddbmm(factor, rest, factor, beta=a)
         if iteration < ITERATIONS - 1:
@@ -166,20 +159,20 @@ def _layout(weight: Tensor) -> torch.memory_format:
 
 
 def _place(value: Any) -> Any:
-    """The storage of a tensor, on which a captured graph depends, or any other value."""
+    """A tensor's storage, on which a captured graph depends; any other value unchanged."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) else value
 
 
 class Muon(torch.optim.AdamW):
-    """Muon for the matrices among parameters, AdamW for all others.
+    """Optimizer with Muon for matrices (:func:`is_matrix`), and AdamW for all other parameters.
 
     Args:
-        parameters: to be moved.
-        matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A
-            number, or, as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so
-            that a captured step follows the schedule.
-        captures: whether a GPU's steps are captured as a CUDA graph.
-        **options: of AdamW; weight decay is for both."""
+        parameters: parameters to optimise.
+        matrix_lr: learning rate of matrices, whose steps are about as long as AdamW's at this rate. A
+            number, or, like AdamW's ``lr``, a scalar tensor on the parameters' device, so that a
+            captured step follows the schedule.
+        captures: whether steps on a GPU are captured as a CUDA graph.
+        **options: options of AdamW; weight decay applies to both."""
 
     def __init__(
         self,
@@ -199,10 +192,10 @@ class Muon(torch.optim.AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
-        """Take a step; the gradients of matrices are removed.
+        """Take a step, and remove the gradients of matrices.
 
         Args:
-            closure: computes the loss and the gradients once more before the step.
+            closure: recomputes the loss and the gradients before the step.
 
         Returns:
             The loss of ``closure``; None without one."""
@@ -224,16 +217,11 @@ class Muon(torch.optim.AdamW):
         return loss
 
     def _states(self, moved: Sequence[nn.Parameter]) -> list[Tensor]:
-        """The optimizer's states of some parameters, which a step writes."""
+        """The optimizer's state tensors of parameters, which a step writes."""
         return [value for parameter in moved for value in self.state.get(parameter, {}).values()]
 
     def _move(self, moved: Sequence[nn.Parameter], gradients: Sequence[Tensor]) -> None:
-        """Take a step along gradients that may lie elsewhere than those of the parameters.
-
-        Args:
-            moved: parameters.
-            gradients: of each.
-        """
+        """Take a step with these gradients, one per parameter, such as the inputs of a captured graph."""
         for parameter, gradient in zip(moved, gradients, strict=True):
             parameter.grad = gradient
         for group in self.param_groups:
@@ -242,13 +230,13 @@ class Muon(torch.optim.AdamW):
         super().step()
 
     def _step_matrices(self, group: dict[str, Any]) -> None:
-        """Take a step of the matrices, and remove their gradients, so that AdamW skips them."""
+        """Update the matrices, and remove their gradients, so that AdamW skips them."""
         moved = [parameter for parameter in group["params"] if parameter.grad is not None]
         if not moved:
             return
         for parameter in moved:
             state = self.state[parameter]
-            if not state:  # AdamW expects a step when it loads a state; nothing here depends on it
+            if not state:  # AdamW requires ``step`` when it loads a state; Muon does not use it
                 state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
         gradients = [parameter.grad for parameter in moved]
         averages = [self.state[parameter]["momentum"] for parameter in moved]
@@ -259,7 +247,7 @@ class Muon(torch.optim.AdamW):
         torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
         torch._foreach_mul_(steps, group["lr"])
         torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])
-        # Steps with another memory layout than their weights would be added one by one.
+        # PyTorch would add steps whose memory layout differs from their weights' one by one.
         shaped = []
         for step, weight in zip(steps, moved, strict=True):
             shaped.append(step.view_as(weight).contiguous(memory_format=_layout(weight)))

@@ -1,4 +1,4 @@
-"""Optimization: AdamW or Muon, a linear schedule over the run's budget, gradient clipping."""
+"""Optimization: AdamW or Muon, a piecewise linear schedule over the run's budget, gradient clipping."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -13,73 +13,73 @@ from ghgs_lit.training.muon import Muon
 from ghgs_lit.weights.checkpoint import STATE_PREFIX
 
 BelowOne = Annotated[float, Field(ge=0, lt=1)]
-#: AdamW's term in the denominator.
+#: AdamW's epsilon, added to the denominator.
 EPS = 1e-8
-#: The first learning rate as a fraction of the highest one.
+#: Initial learning rate as a fraction of the highest one.
 START_FACTOR = 0.04
-#: Where a learning rate is a number: PyTorch's AdamW rounds a tensor's to float32 on a CPU.
+#: Devices on which learning rates stay numbers: on a CPU, PyTorch's AdamW rounds a tensor to float32.
 _BY_NUMBER = ("cpu", "mps")
 
 
 def named_weights(module: nn.Module) -> Iterator[tuple[str, nn.Parameter]]:
-    """Parameters by the names that configurations and messages use.
+    """Yield parameters with the names that configurations and messages use.
 
     Args:
-        module: a model, or a LightningModule, in which other parts than the model (a loss, a
-            renderer) can have weights, too.
+        module: a model, or a LightningModule, in which other submodules (a loss, a renderer) may have
+            weights, too.
 
-    Returns:
-        Names and parameters: those of the model by their names in it, such as
-        ``gaussian_head.conv.weight``, all others by their names in the LightningModule, such as
+    Yields:
+        Name and parameter. Names of the model's parameters are relative to it, such as
+        ``gaussian_head.conv.weight``; all others are relative to the LightningModule, such as
         ``losses.network.weight``."""
     for name, parameter in module.named_parameters():
         yield name.removeprefix(STATE_PREFIX), parameter
 
 
 class Optimization(Options):
-    """AdamW or Muon, with a learning rate that rises linearly to ``lr`` and then falls linearly,
-    over the used share of the run's budget of steps or of time, whichever is larger."""
+    """AdamW or Muon, with a learning rate that rises linearly to ``lr`` and then falls linearly over the
+    used share of the run's budget of steps or time, whichever is larger."""
 
     group = "optimizer"
     lr: Positive = 1e-4
     """Highest learning rate."""
     matrix_scale: Positive | None = None
-    """Learning rate of matrices, which take Muon's orthogonal steps, in units of lr;
-    null: AdamW for all."""
+    """Learning rate of matrices, which Muon updates with orthogonal steps, in units of lr;
+    null: AdamW for all parameters."""
     betas: tuple[BelowOne, BelowOne] = (0.9, 0.999)
-    """AdamW's averages of the gradient and of its square."""
+    """AdamW's decay of the averages of the gradient and of its square."""
     weight_decay: Amount = 1e-5
     """Decoupled weight decay."""
     warmup: BelowOne = 0.01
-    """Share of the run in which the learning rate rises from 0.04 lr to lr."""
+    """Share of the run during which the learning rate rises from 0.04 lr to lr."""
     end_factor: Share = 5e-4
-    """Last learning rate as a fraction of lr."""
+    """Final learning rate as a fraction of lr."""
     clip: Positive = 1.0
     """Maximum norm of the gradient."""
     freeze_until: dict[str, Share] = Field({})
-    """Beginning of parameter names: share of the run in which these parameters stay unchanged."""
+    """Prefixes of parameter names: share of the run during which these parameters stay frozen."""
     skip_nonfinite: Index = 0
-    """Steps in a row that are not finite and are skipped before the run stops;
-    0: it stops at the first."""
+    """Maximum number of consecutive steps that are skipped because their loss or gradient is not finite;
+    0: the run stops at the first."""
 
     def optimizer(self, module: nn.Module, fused: bool = True, captures: bool = True) -> torch.optim.AdamW:
-        """The optimizer of all trained parameters.
+        """Build the optimizer of all parameters that require gradients.
 
-        On a GPU it counts steps there (``capturable``), so that its step can be captured as a CUDA
-        graph; the learning rates become tensors by :func:`hold_rates`.
+        On a GPU it counts steps on the device (``capturable``), so that a step can be captured as a CUDA
+        graph; :func:`hold_rates` turns its learning rates into tensors.
 
         Args:
-            module: a model, or a LightningModule with all that has weights,
-                on the device of the training.
-            fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside
-                its step, too late for clipping gradients.
-            captures: whether Muon's steps are captured as a CUDA graph on a GPU.
+            module: a model, or a LightningModule with everything that has weights, on the training
+                device.
+            fused: use PyTorch's fused AdamW, the fastest. It unscales gradients (``16-mixed``) inside
+                its step, which is too late for clipping.
+            captures: whether Muon's steps on a GPU are captured as a CUDA graph.
 
         Returns:
-            AdamW, or Muon where there is a ``matrix_scale``.
+            AdamW, or Muon if ``matrix_scale`` is set.
 
         Raises:
-            InputError: ``freeze_until`` names no parameter."""
+            InputError: a prefix in ``freeze_until`` matches no parameter."""
         named = list(named_weights(module))
         for prefix in self.freeze_until:
             known = any(name.startswith(prefix) for name, _ in named)
@@ -93,11 +93,11 @@ class Optimization(Options):
         return Muon(parameters, self.matrix_scale * self.lr, captures, **options)
 
     def drop_frozen_gradients(self, module: nn.Module, progress: float) -> None:
-        """Remove gradients of frozen parameters, so that the optimizer leaves them unchanged, also
-        by weight decay.
+        """Remove the gradients of parameters that ``freeze_until`` freezes, so that the optimizer,
+        including its weight decay, leaves them unchanged.
 
         Args:
-            module: that of :meth:`optimizer`.
+            module: see :meth:`optimizer`.
             progress: used share of the run's budget in [0, 1]."""
         frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
         if not frozen:
@@ -107,20 +107,20 @@ class Optimization(Options):
                 parameter.grad = None
 
     def clip_gradients(self, module: nn.Module) -> Tensor:
-        """Scale all gradients so that their common norm is at most ``clip``.
+        """Scale all gradients so that their joint norm is at most ``clip``, without a synchronisation.
 
         Args:
-            module: that of :meth:`optimizer`.
+            module: see :meth:`optimizer`.
 
         Returns:
-            The norm before, without dimensions, on the module's device, without a synchronisation."""
+            The norm before clipping, a scalar on the module's device."""
         return nn.utils.clip_grad_norm_(module.parameters(), self.clip, foreach=True)
 
     def factor(self, progress: float) -> float:
         """Learning rate as a fraction of ``lr``.
 
         Args:
-            progress: used share of the run's budget in [0, 1], or more."""
+            progress: used share of the run's budget; the rate is constant from 1 on."""
         if progress < self.warmup:
             return START_FACTOR + (1 - START_FACTOR) * progress / self.warmup
         fall = (progress - self.warmup) / (1 - self.warmup)
@@ -128,21 +128,20 @@ class Optimization(Options):
 
 
 def hold_rates(optimizer: torch.optim.Optimizer) -> None:
-    """Hold learning rates as tensors on a GPU:
-    a captured step reads what the schedule writes there.
+    """Turn learning rates into tensors on the GPU, where captured steps read what the schedule writes.
 
     Args:
-        optimizer: of :meth:`Optimization.optimizer`; unchanged where it is not ``capturable``."""
+        optimizer: see :meth:`Optimization.optimizer`; unchanged if it is not ``capturable``."""
     for group in optimizer.param_groups:
         if group["capturable"]:
             group["lr"] = torch.full((), float(group["lr"]), device=group["params"][0].device)
 
 
 def plain_rates(checkpoint: dict) -> None:
-    """Put numbers in the place of learning rates that are tensors (:func:`hold_rates`).
+    """Replace learning rates that are tensors (:func:`hold_rates`) by numbers.
 
     Args:
-        checkpoint: with the states of Lightning's optimizers and schedules."""
+        checkpoint: Lightning's, with the states of optimizers and schedules; changed in place."""
     for state in checkpoint.get("optimizer_states", ()):
         for group in state["param_groups"]:
             group["lr"] = float(group["lr"])

@@ -1,5 +1,5 @@
-"""The pretext stage: parts of bodies that patches show, a branch that learns them, and a measure of how
-well features distinguish them."""
+"""Pretext training of the semantic branch: body parts as labels of patches, the LightningModule, and a
+metric of how well features distinguish parts."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -25,7 +25,7 @@ from ghgs_lit.training.guard import DivergedError
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 
-#: Parts of a body that patches are labelled with.
+#: Body parts with which patches are labelled.
 PARTS = (
     "head", "chest", "abdomen", "hips",
     "left upper arm", "right upper arm", "left forearm", "right forearm", "left hand", "right hand",
@@ -34,19 +34,19 @@ PARTS = (
 
 
 class BodyParts(Options):
-    """A body model whose vertices have known parts: a kind of ``parts``, which plug-ins offer."""
+    """Body parts of the vertices of a body model. Plug-ins register subclasses as kinds of ``parts``."""
 
     vertices: ClassVar[int]
-    """Number of vertices, by which bodies of the model are recognised."""
+    """Number of vertices, which identifies the body model."""
 
     def of_vertices(self) -> np.ndarray:
-        """The part of each vertex [n], an index into :data:`PARTS`."""
+        """Return the part of each vertex, [n] indices into :data:`PARTS`."""
         raise NotImplementedError
 
 
 @cache
 def _vertex_parts(vertices: int) -> np.ndarray | None:
-    """Parts of the body model of so many vertices; None: no plug-in has it."""
+    """Parts of the body model with this number of vertices; None: no plug-in provides it."""
     for kind in registry.kinds_of(registry.PARTS):
         body = registry.class_of(registry.PARTS, kind, registry.PARTS)
         if body.vertices == vertices:
@@ -55,20 +55,22 @@ def _vertex_parts(vertices: int) -> np.ndarray | None:
 
 
 def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """The body part of each world point on clothes, hair or skin:
-    that of the nearest vertex of the skin.
+    """Label world points on clothes, hair or skin with the part of the nearest vertex of the body.
 
     Args:
-        points: in the unit of ``vertices``.
-        vertices: of the posed body, all of them.
+        points: world points, in the unit of ``vertices``.
+        vertices: all vertices of the posed body.
+
+    Returns:
+        Indices into :data:`PARTS`.
 
     Raises:
-        InputError: no plug-in has the parts of a body of so many vertices.
+        InputError: no plug-in provides the parts of a body with this number of vertices.
     """
     parts = _vertex_parts(len(vertices))
     expected = "those of a body whose parts are known, as of a built-in person (data=synthetic)"
     require(parts is not None, "vertices of the body", expected, len(vertices))
-    # For one batch: a tree that is quick to build, not the quickest to query.
+    # The tree serves one batch only: these options make it fast to build, not fastest to query.
     tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)
     nearest = tree.query(points.double().cpu().numpy())[1]
     return torch.from_numpy(parts[nearest]).to(points.device)
@@ -78,15 +80,15 @@ def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
     """Shares of :data:`PARTS` among the subject's pixels of each patch.
 
     Args:
-        batch: with true depths and vertices of bodies whose parts are known; sides are divisible by
-            the patch size.
+        batch: a batch with true depths and with vertices of bodies whose parts are known; image sides
+            are divisible by the patch size.
         patch_size: side of a patch in pixels.
 
     Returns:
-        Shares of each patch, ordered by image, row and column; 0 without a pixel of the subject.
+        Shares of each patch, ordered by image, row and column; 0 in patches without the subject.
 
     Raises:
-        InputError: no depths, no bodies, or other bodies."""
+        InputError: the batch has no depths, no bodies, or bodies whose parts are unknown."""
     require(batch.depths is not None, "data", "true depths, which the labels are made from", "none")
     require(batch.body_vertices is not None, "data", "people with bodies, as data=synthetic", "none")
     b, v, height, width = batch.depths.shape
@@ -107,15 +109,15 @@ def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
 def neighbor_shows_part(
     features: Float[Tensor, "n c"], parts: Int[Tensor, " n"], views: Int[Tensor, " n"]
 ) -> Bool[Tensor, " n"]:
-    """Whether the most similar patch (cosine) of the other views shows the same part as a patch.
+    """Whether the most similar patch of another view (by cosine similarity) shows the same part.
 
     Args:
-        features: of the patches of one person.
-        parts: the part that each patch shows.
-        views: the view of each patch.
+        features: features of the patches of one person.
+        parts: part of each patch.
+        views: view of each patch.
 
     Returns:
-        A value for each patch; false without other views."""
+        A value for each patch; False if there are no other views."""
     directions = unit(features)
     cosines = (directions @ directions.T).masked_fill(views[:, None] == views, -torch.inf)
     best, nearest = cosines.max(1) if len(features) else (cosines.new_zeros(0), views)
@@ -123,20 +125,17 @@ def neighbor_shows_part(
 
 
 class Pretext(nn.Module):
-    """A semantic branch under its name in a model.
-
-    Args:
-        branch: to be trained."""
+    """Wrapper of a semantic branch that gives its weights the same names as in a full model."""
 
     def __init__(self, branch: SemanticBranch):
         super().__init__()
         self.encoder = nn.ModuleDict({"semantic": branch})
 
     def forward(self, batch: Batch) -> tuple[Float[Tensor, "N P"], Float[Tensor, "N P"], KeptPatches]:
-        """Predict which parts the patches of subjects show.
+        """Predict the shares of body parts in the foreground patches.
 
         Args:
-            batch: with true depths and bodies whose parts are known.
+            batch: see :func:`part_shares`.
 
         Returns:
             Logarithms of predicted shares, true shares, and their patches."""
@@ -147,31 +146,26 @@ class Pretext(nn.Module):
 
 
 def cross_entropy(log_shares: Float[Tensor, "N P"], shares: Float[Tensor, "N P"]) -> Tensor:
-    """Mean cross-entropy over the patches with a part.
+    """Mean cross-entropy over the patches that show a part.
 
     Args:
-        log_shares: logarithms of predicted shares of the parts.
+        log_shares: logarithms of the predicted shares.
         shares: true shares, all 0 in a patch without a part.
 
     Returns:
-        A value without dimensions; 0 without any patch."""
+        A scalar; 0 if no patch shows a part."""
     return -(shares * log_shares).sum() / shares.any(1).sum().clamp_min(1)
 
 
 class PretextModule(BudgetedModule):
-    """Trains a semantic branch to distinguish body parts.
-
-    Args:
-        model: the branch.
-        optimization: as of :class:`BudgetedModule`.
-        config: as of :class:`BudgetedModule`."""
+    """Trains a semantic branch to distinguish body parts; arguments as for :class:`BudgetedModule`."""
 
     def __init__(self, model: Pretext, optimization: Optimization, config: Mapping[str, Any]):
         super().__init__(model, optimization, config)
         self.part_accuracy = MeanMetric()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Run a step and log its loss; returns it."""
+        """Compute, log and return the loss."""
         loss = cross_entropy(*self.model(batch)[:2])
         size = len(batch.images)
         self.log("loss/parts", loss.detach(), prog_bar=True, batch_size=size)
@@ -179,7 +173,7 @@ class PretextModule(BudgetedModule):
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Measure a batch, person by person."""
+        """Measure the accuracy of nearest patches per person, and the loss."""
         log_shares, shares, kept = self.model(batch)
         features = features_of(log_shares)
         part = shares.argmax(1)
@@ -194,10 +188,8 @@ class PretextModule(BudgetedModule):
         self.log("val/parts", cross_entropy(log_shares, shares), on_epoch=True, batch_size=size)
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip`` and log the norm before.
-
-        Args:
-            optimizer, gradient_clip_val, gradient_clip_algorithm: of Lightning; not used.
+        """Clip the gradients to a norm of ``optimizer.clip``, and log their norm before. Lightning's
+        arguments are not used.
 
         Raises:
             DivergedError: the norm is not finite."""

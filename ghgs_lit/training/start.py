@@ -1,4 +1,4 @@
-"""Start of training: from nothing, from the weights of another run, or from an interrupted run."""
+"""Start of training: from scratch, from the weights of another run, or from an interrupted run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 def check_start(run: "Train", directory: Path) -> None:
-    """Reject ``init_from`` together with ``resume``, unless the run resumes in its own directory:
-    then its configuration still has the ``init_from`` that it began with.
+    """Reject ``init_from`` together with ``resume``, unless the run resumes in its own directory, where
+    its configuration still contains the ``init_from`` with which it began.
 
     Args:
-        run: as configured.
-        directory: of the run.
+        run: configuration of the run.
+        directory: the run's directory.
 
     Raises:
         InputError: both are given."""
@@ -41,15 +41,15 @@ def check_resume(
 
     Args:
         path: the checkpoint.
-        module: with a ``model``; gets the weights of all its parts.
+        module: the module that gets the weights of all its submodules.
         config: the run's configuration as plain data.
 
     Returns:
         The step of the checkpoint, and one line for each setting that ``config`` changes.
 
     Raises:
-        InputError: not a checkpoint of a training run, of another model or loss (names the tensor)
-            or optimizer, or damaged."""
+        InputError: the checkpoint is damaged, not of a training run, or of another model, loss
+            (the message names the tensor) or optimizer."""
     checkpoint = read_checkpoint(path, whole=True)
     step = checkpoint.get("global_step")
     for key, kind in (("global_step", int), ("optimizer_states", list)):
@@ -68,18 +68,18 @@ def check_resume(
 def initialize(
     model: nn.Module, path: str | Path, strict: bool = False, random_frozen: bool = False
 ) -> list[str]:
-    """Load the weights of a checkpoint that fit into a model.
+    """Load those weights of a checkpoint that fit into a model.
 
     Args:
-        model: gets the weights.
+        model: the model that gets the weights.
         path: the checkpoint.
-        strict: every tensor must fit, those of other stages apart where the file has the
-            encoder alone.
-        random_frozen: parameters that are not trained may stay as initialised.
+        strict: every tensor must fit, except those of other stages if the file contains only the
+            encoder.
+        random_frozen: frozen parameters may stay as initialised.
 
     Returns:
         A line for each tensor: ``loaded``, ``wrong shape`` or ``missing`` (both stay as
-        initialised) or ``ignored`` (not in the model).
+        initialised), or ``ignored`` (not in the model).
 
     Raises:
         InputError: not a checkpoint of this project; nothing fits; a parameter that is not trained
@@ -118,22 +118,23 @@ def initialize(
 
 
 def with_origin(run: "Train", model: nn.Module) -> "Train":
-    """Take over the origin of the semantic features, which tables read.
+    """Adopt ``encoder.weights``, the origin of the semantic features in tables, from the checkpoint from
+    which a run starts.
 
     Args:
-        run: as configured.
-        model: of the run.
+        run: configuration of the run.
+        model: the run's model.
 
     Returns:
-        The run with ``encoder.weights`` from the checkpoint that it starts from, if it has one and
-        all these weights fit; else ``run``."""
+        The configuration with the checkpoint's ``encoder.weights``, if it has this key and all these
+        weights fit; otherwise ``run`` unchanged."""
     path = run.resume or run.init_from
     if path is None:
         return run
     checkpoint = read_checkpoint(path)
     origin = lookup(checkpoint["config"], "encoder.weights")
     state = model_state(checkpoint)
-    has_branch = getattr(run.encoder, "semantic", None) is not None  # a plug-in's may have none
+    has_branch = getattr(run.encoder, "semantic", None) is not None  # a plug-in's encoder may lack it
     fits = has_branch == (lookup(checkpoint["config"], "encoder.semantic") is not None)
     source = "encoder.semantic." if has_branch else "encoder."
     for name, tensor in model.state_dict().items():
@@ -145,15 +146,15 @@ def with_origin(run: "Train", model: nn.Module) -> "Train":
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """Sum up what was loaded.
+    """Summarise what was loaded, and write all lines to a file.
 
     Args:
-        lines: of :func:`initialize`.
+        lines: result of :func:`initialize`.
         path: the checkpoint.
-        written: a file that gets all lines.
+        written: the file.
 
     Returns:
-        At most 22 lines, in which loaded tensors are only counted."""
+        At most 22 lines of text, in which loaded tensors are only counted."""
     written.write_text("\n".join(lines) + "\n")
     others = [line for line in lines if not line.startswith("loaded")]
     loaded = len(lines) - len(others)

@@ -1,4 +1,4 @@
-"""Lightning's Trainer and its options."""
+"""Options of Lightning's Trainer, and its construction."""
 
 from typing import Annotated, Any, Literal
 
@@ -11,7 +11,7 @@ from ghgs_lit.config.options import Count, Index, Options, Share, Words
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import round_products
 
-#: Limits that keep every duration in Python's range.
+#: Durations in Lightning's notation, limited to the range of Python's timedelta.
 Duration = Annotated[
     Annotated[str, Field(pattern=r"^\d{1,8}(:\d{1,9}){3}$")]
     | dict[str, Annotated[float, Field(ge=0, le=1e8)]],
@@ -19,69 +19,65 @@ Duration = Annotated[
 ]
 
 
-#: Lightning's other numbers compute elsewhere (``bf16-true``) or need another library.
+#: Lightning's other precisions change the dtype of weights (``bf16-true``) or need another library.
 Precision = Annotated[
     Literal["32-true", "tf32", "bf16-mixed", "16-mixed", "32", "bf16", "16", 32, 16],
     Words("32-true, tf32, bf16-mixed or 16-mixed"),
 ]
-#: Batches of an epoch, as a number or a share.
+#: Batches of an epoch, as a number or as a share in (0, 1].
 Batches = Count | Annotated[float, Field(gt=0, le=1)]
 
 _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
 
 class TrainerOptions(Options):
-    """Duration and devices of a training, and intervals of validation and logging."""
+    """Duration and devices of a training, and intervals of validations and logs."""
 
     group = "trainer"
     accelerator: Literal["gpu", "cpu", "auto", "cuda"] = "gpu"
-    """gpu, cpu or auto."""
+    """Kind of device: gpu, cpu or auto."""
     devices: Annotated[int, Field(ge=1, le=64)] | tuple[Index, ...] | Literal[-1, "auto"] = 1
-    """Number of processes, or a list of GPUs (of a CPU: as many processes); several are DDP, in
-    which each has all parameters. At most 64, as each starts at once on a CPU."""
+    """Number of processes, or a list of GPUs (on a CPU: one process per entry). Several train with DDP, in
+    which each holds all parameters. At most 64, as on a CPU all start at once."""
     num_nodes: int = Field(1, ge=1, le=1024)
-    """Machines, each with devices processes; SLURM or torchrun starts them."""
+    """Number of machines, each with the processes of devices; SLURM or torchrun starts them."""
     strategy: Literal[
         "auto", "ddp", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_false"
     ] = "auto"
-    """Of several processes; auto: DDP that allows parameters without a gradient,
-    as ablations have."""
+    """Strategy for several processes; auto: DDP that allows parameters without a gradient, which
+    ablations have."""
     precision: Precision = "32-true"
-    """32-true (the paper's; convolutions too), tf32, bf16-mixed or 16-mixed;
-    geometry is float32 in each."""
+    """32-true (the paper's, also for convolutions), tf32, bf16-mixed or 16-mixed; geometry is always
+    float32."""
     max_steps: int = Field(200000, ge=-1)
     """Steps of the optimizer (the paper's 200000); -1: no limit."""
     max_time: Duration | None = None
-    """days:hours:minutes:seconds; the learning rate follows the budget that ends first;
-    null: no limit."""
+    """Limit of time as days:hours:minutes:seconds; null: no limit. The learning rate follows the budget
+    of steps or time, whichever ends first."""
     val_check_interval: Count = 5000
     """Steps of the optimizer between two validations."""
     limit_val_batches: Index | Share = 8
-    """Batches of each validation; 0: none."""
+    """Batches of each validation, or their share; 0: no validation."""
     log_every_n_steps: Index = 50
     """Steps between two logged values."""
     accumulate_grad_batches: Count = 1
-    """Batches of each step."""
+    """Batches whose gradients each step accumulates."""
     deterministic: bool | Literal["warn"] = False
-    """true: only deterministic operations, where PyTorch has them."""
+    """true: use deterministic operations only, and raise where PyTorch has none; warn: warn there."""
     limit_train_batches: Batches | None = None
-    """Batches of an epoch, or their share; null: all."""
+    """Training batches of an epoch, or their share; null: all."""
     overfit_batches: Index | Share = 0.0
-    """The first so many batches of the training, or their share, again and again; 0: all."""
+    """Train repeatedly on this number of first batches, or on this share; 0: on all."""
     fast_dev_run: bool | Count = False
-    """true, or a number of steps: so few, a validation of as many batches, no logs:
-    whether all runs."""
+    """Smoke test: true (one) or a number of steps, then a validation of as many batches, without logs."""
     profiler: Literal["simple", "advanced", "pytorch"] | None = None
-    """Times of Lightning's hooks, written to <run>/fit-profile.txt."""
+    """Lightning's profiler, which writes the times of hooks to <run>/fit-profile.txt."""
 
     def build(self, **arguments: Any) -> L.Trainer:
-        """The Trainer.
+        """Build a Trainer that counts validations in steps and has no limit of epochs.
 
         Args:
-            **arguments: further ones of Lightning's Trainer.
-
-        Returns:
-            A Trainer that counts validations in steps and has no limit of epochs.
+            **arguments: further arguments of Lightning's Trainer.
 
         Raises:
             InputError: Lightning rejects the options."""
@@ -89,7 +85,7 @@ class TrainerOptions(Options):
         options["val_check_interval"] *= self.accumulate_grad_batches  # Lightning counts batches
         if self.precision == "tf32":
             options["precision"] = "32-true"
-        round_products(self.precision == "tf32")  # also back, after another run of the process
+        round_products(self.precision == "tf32")  # resets it after another run in the same process
         if self.accelerator == "cpu" and isinstance(self.devices, tuple):
             options["devices"] = len(self.devices)
         alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
@@ -97,7 +93,7 @@ class TrainerOptions(Options):
             # Not every parameter has a gradient in every step (ablations, skipped work).
             options["strategy"] = "ddp_find_unused_parameters_true"
         if self.profiler is not None:
-            # Into files: its log lines are silenced with Lightning's others.
+            # Written to files, as Lightning's log lines are silenced.
             folder = arguments.get("default_root_dir")
             options["profiler"] = _PROFILERS[self.profiler](dirpath=folder, filename="profile")
         try:

@@ -1,4 +1,4 @@
-"""Pictures, attention and point clouds of the first validation subjects."""
+"""Validation pictures, attention maps and point clouds of the first subjects."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,7 +18,7 @@ from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.pictures import clouds, save_png, sheet
 
-#: TensorBoard's view of clouds: points of two centimetres through a perspective camera.
+#: TensorBoard's view of point clouds: points of two centimetres in a perspective camera.
 CLOUD_VIEW = {
     "camera": {"cls": "PerspectiveCamera", "fov": 40},
     "material": {"cls": "PointsMaterial", "size": 0.02},
@@ -27,35 +27,34 @@ CLOUD_VIEW = {
 
 class PicturesOptions(Options):
     """Pictures of the first subjects of each validation;
-    of the first one also attention and point clouds."""
+    of the first one also its attention and point clouds."""
 
     group = "callbacks.pictures"
     subjects: Index = 2
     """Number of subjects; 0: none."""
     token: tuple[Index, Index, Index] | None = None
-    """Whose attention is shown: view, row and column on the grid of tokens of padded photographs;
+    """Token whose attention is shown: view, row and column in the token grid of the padded views;
     null: the middle of the subject in its first view."""
 
     def build(self) -> "Pictures":
-        """The callback."""
+        """Create the callback."""
         return Pictures(self)
 
 
 class Pictures(Callback):
-    """Logs ``view/sheet/<subject>``, ``view/attention/<subject>``, in TensorBoard's tabs of
-    distributions ``values/*`` and in its mesh tab ``<subject>/points``. A sheet has inputs, depths,
-    targets, renders and errors. Attention is of one token of the recalibration. Clouds are the
-    predicted points and the body's vertices.
+    """Logs pictures of validation subjects, and writes them to ``<run>/pictures``.
 
-    Args:
-        options: which subjects to draw."""
+    * ``view/sheet/<subject>``: inputs, depths, targets, renderings and errors;
+    * ``view/attention/<subject>``: attention of one token of the recalibration;
+    * ``values/*``, in TensorBoard's tabs of distributions: values of all Gaussians;
+    * ``<subject>/points``, in its mesh tab: the predicted points and the body's vertices."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options
         self._stack = ExitStack()
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Watch the recalibration for the first batch."""
+        """Start recording calls of the recalibration for the first batch."""
         self._number = 0
         stage = getattr(pl_module.model, "recalibration", None)
         self._calls = self._stack.enter_context(seen_calls(stage if self.options.subjects else None))
@@ -68,12 +67,12 @@ class Pictures(Callback):
         batch: Batch,
         *args: Any,
     ) -> None:
-        """Draw the next subjects.
+        """Log the subjects of a batch, up to the configured number.
 
         Args:
-            trainer, pl_module: of the run.
-            outputs: of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`.
-            batch: that was validated.
+            trainer, pl_module: those of the run.
+            outputs: result of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`.
+            batch: the validated batch.
             *args: not used."""
         self._stack.close()
         prediction = outputs["prediction"]
@@ -93,7 +92,7 @@ class Pictures(Callback):
         self._calls = []
 
     def _show_attention(self, trainer: L.Trainer, batch: Batch, call: Call, name: str) -> None:
-        """Publish whom the chosen token of the first subject attends to."""
+        """Log the attention of the chosen token of the first subject."""
         _, tokens, points = call
         token = chosen_token(tokens, points, 0, self.options.token)
         attention = None if token is None else attention_of(*call, token)
@@ -104,14 +103,11 @@ class Pictures(Callback):
 
 
 def distributions(prediction: Prediction) -> dict[str, Tensor]:
-    """Values of all Gaussians.
-
-    Args:
-        prediction: of a model.
+    """Values of all Gaussians of a prediction, for histograms.
 
     Returns:
-        Finite values by name: opacities, standard deviations in millimetres and, where their pixels
-        are known, the distances from these pixels' points, in millimetres."""
+        Finite values by name: opacities, standard deviations in millimetres and, if their pixels are
+        known, the distances from these pixels' points, in millimetres."""
     gaussians = prediction.gaussians
     known = {"opacity": gaussians.opacities, "scale_mm": 1000 * gaussians.scales}
     if gaussians.pixel is not None:
@@ -121,7 +117,7 @@ def distributions(prediction: Prediction) -> dict[str, Tensor]:
 
 
 def _log_values(writer: SummaryWriter, batch: Batch, prediction: Prediction, name: str, step: int) -> None:
-    """Log the :func:`distributions`, and the point clouds of the first subject."""
+    """Log :func:`distributions`, and the point clouds of the first subject, to TensorBoard."""
     for kind, values in distributions(prediction).items():
         if len(values):
             writer.add_histogram(f"values/{kind}", values, step)
@@ -131,14 +127,8 @@ def _log_values(writer: SummaryWriter, batch: Batch, prediction: Prediction, nam
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
-    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it to loggers of pictures.
-
-    Args:
-        trainer: with the loggers, the folder of the run and the step.
-        tag: name in the loggers.
-        picture: [h, w, 3] uint8.
-        file: name without suffix.
-    """
+    """Write a picture [h, w, 3] uint8 to ``<run>/pictures/step_<step>/<file>.png``, and log it under
+    ``tag``."""
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
     for logger in trainer.loggers:
