@@ -1,5 +1,7 @@
-"""Chamfer distance between two point sets (the paper's geometric loss L_geom). Nearest neighbours
-are exact and carry no gradient; the gradient runs through the matched pairs only."""
+"""Chamfer distance between two point sets, the paper's geometric loss L_geom.
+
+The search for nearest neighbours is exact and has no gradient; gradients flow through the matched
+pairs only."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,22 +11,23 @@ from torch import Tensor
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 
-#: Distances in the memory of an accelerator at once.
+#: Largest number of distances in the memory of an accelerator at once.
 _DISTANCES = 1 << 26
-#: Candidates of each query that are compared exactly.
+#: Candidates of each query whose distances are computed from differences.
 _CANDIDATES = 4
 
 
 def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """The nearest reference of each query: on the CPU by a k-d tree in float64, elsewhere by
-    :func:`nearest_by_products`.
+    """Find the nearest reference of each query.
+
+    Uses a k-d tree in float64 on the CPU and :func:`nearest_by_products` elsewhere.
 
     Args:
         queries: points [n, 3].
-        references: points [m, 3]; not empty, finite.
+        references: points [m, 3]; at least one, all finite.
 
     Returns:
-        Indices [n] of references; any of them for a query that is not finite.
+        Indices [n] into ``references``; arbitrary for a query that is not finite.
     """
     queries = at_least_float32(queries.detach())
     references = at_least_float32(references.detach())
@@ -41,20 +44,20 @@ def nearest_by_products(
     references: Float[Tensor, "m 3"],
     counts: Bool[Tensor, " m"] | None = None,
 ) -> Int[Tensor, " n"]:
-    """:func:`nearest` by matrix products: ``|r|^2 - 2 q r`` finds a few candidates,
-    differences decide.
+    """Find the nearest reference of each query by matrix products.
 
-    In float32 the products are off by some 1e-7 of a squared metre around the middle of the
-    references. Differences to all references (``torch.cdist`` without products) took 4 s on a GPU
-    for 160 000 Gaussians and 10 475 vertices.
+    ``|r|^2 - 2 q r`` selects a few candidates, whose exact distances from differences decide. In
+    float32 the products have an error of about 1e-7 m^2 near the mean of the references.
+    Differences to all references (``torch.cdist`` without products) took 4 s on a GPU for 160 000
+    Gaussians and 10 475 vertices.
 
     Args:
-        queries: points [n, 3]; finite.
-        references: points [m, 3]; not empty, finite.
-        counts: which references can be found; None: all. Without one, any is.
+        queries: points [n, 3], all finite.
+        references: points [m, 3]; at least one, all finite.
+        counts: which references are searched; None: all. If none is, the result is arbitrary.
 
     Returns:
-        Indices [n] of references.
+        Indices [n] into ``references``.
     """
     if counts is None:
         middle = references.mean(0)
@@ -79,14 +82,11 @@ def nearest_by_products(
 
 
 def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, "m 3"]:
-    """Some of the points, evenly spaced in memory from a random start.
+    """Select at most ``limit`` points, evenly spaced in memory from a random start.
 
     Args:
         points: any points [n, 3].
-        limit: largest number of points that remain, 1 or more; None: all.
-
-    Returns:
-        The points, or ``limit`` of them.
+        limit: largest number of points, 1 or more; None: all.
     """
     if limit is None or len(points) <= limit:
         return points
@@ -98,8 +98,8 @@ def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, 
 def chamfer(
     points: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], limit: int | None = None
 ) -> Float[Tensor, ""]:
-    """Mean squared distance from each point to its nearest reference,
-    plus the mean the other way round.
+    """Mean squared distance from points to their nearest references, plus that of the other
+    direction.
 
     Args:
         points: the prediction [n, 3], in metres.
@@ -108,7 +108,7 @@ def chamfer(
             that the mean stays unbiased); None: all.
 
     Returns:
-        The distance in square metres; 0 if either set is empty (with a gradient of 0), nan if a
+        The distance in square metres; 0 with a gradient of 0 if a set is empty, nan if a
         coordinate is not finite.
     """
     points = at_least_float32(points)
@@ -127,15 +127,12 @@ def chamfer(
 def chamfer_of_rows(
     points: Float[Tensor, "n 3"], counts: Bool[Tensor, " n"], references: Float[Tensor, "m 3"]
 ) -> Float[Tensor, ""]:
-    """:func:`chamfer` of the points that count, without a wait for their number: work of one size.
+    """:func:`chamfer` of the valid points, with fixed shapes and no device-to-host synchronisation.
 
     Args:
-        points: the prediction [n, 3], in metres; not empty.
-        counts: which points count.
-        references: the surface [m, 3], in metres; not empty.
-
-    Returns:
-        As of :func:`chamfer`.
+        points: the prediction [n, 3], in metres; at least one.
+        counts: which points are valid.
+        references: the surface [m, 3], in metres; at least one.
     """
     points = at_least_float32(points)
     references = at_least_float32(references)

@@ -1,5 +1,5 @@
-"""Tensors that depend on sizes alone, made once for each device:
-each takes a GPU at least one launch."""
+"""Tensors that depend on sizes alone, computed once per device: each costs a GPU at least one
+launch."""
 
 from collections.abc import Callable
 from functools import cache, lru_cache
@@ -11,68 +11,52 @@ from torch import Tensor
 def constant(
     make: Callable[..., Tensor], *sizes: object, like: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """``make(*sizes, dtype=, device=)``, computed once for the device of ``like``;
-    never to be changed.
+    """Return the cached ``make(*sizes, dtype=, device=)``.
+
+    All callers share the tensor: never change it in place.
 
     Args:
-        make: a function of PyTorch, such as ``torch.arange``, or one with the same two keywords.
-        sizes: its hashable arguments.
-        like: has the device, and the dtype unless one is given.
+        make: a function of PyTorch, such as ``torch.arange``, or any with these two keywords.
+        sizes: its positional arguments, hashable.
+        like: gives the device, and the dtype if ``dtype`` is None.
         dtype: of the result.
-
-    Returns:
-        The tensor that all callers share.
     """
     make_once = _made if like.device.type == "cpu" else _kept
     return make_once(make, sizes, dtype or like.dtype, like.device)
 
 
 @lru_cache(maxsize=128)
-@torch.inference_mode(False)  # they may be used with a gradient later
+@torch.inference_mode(False)  # a later use may need gradients
 def _made(make: Callable[..., Tensor], sizes: tuple, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Make a constant on the CPU and copy it to its device without a wait.
-
-    Args:
-        make: as for :func:`constant`, as is the next.
-        sizes: arguments of ``make``.
-        dtype: of the result.
-        device: of the result.
-
-    Returns:
-        The tensor.
-    """
-    # A list that is copied to a GPU by itself makes the host wait.
+    """Compute a constant on the CPU and copy it to its device."""
+    # A tensor made from a list directly on a GPU synchronises device and host.
     return make(*sizes, dtype=dtype, device="cpu").to(device, non_blocking=True)
 
 
-#: Without a limit: CUDA graphs read the memory of constants as long as they
-#: are replayed.
+#: Without a limit: captured CUDA graphs read the memory of constants at every replay.
 _kept = cache(_made.__wrapped__)
 
 
 def middles(count: int, **kind: object) -> Tensor:
-    """The middles of equal parts of the way from 0 to 1.
+    """Midpoints [count], ascending, of ``count`` equal parts of [0, 1].
 
     Args:
-        count: number of parts S.
+        count: number of parts.
         kind: ``dtype`` and ``device``.
-
-    Returns:
-        Numbers [S], ascending.
     """
     return (torch.arange(count, **kind) + 0.5) / count
 
 
 def other_images(elements: int, views: int, **kind: object) -> Tensor:
-    """For each image ``b * V + v``, the images of the element's other views in cyclic order.
+    """Indices of the other views of each image's element, in cyclic order.
 
     Args:
         elements: batch size B.
-        views: V, number of views of each element.
+        views: number of views V of each element.
         kind: ``dtype`` and ``device``.
 
     Returns:
-        Numbers of images [B V, V - 1].
+        Indices of images [B V, V - 1]; image ``b * V + v`` is view v of element b.
     """
     view = torch.arange(views, **kind)
     others = (view[:, None] + view[1:]) % views

@@ -1,9 +1,9 @@
-"""Coordinate frame of the subject: the stages see each scene in metres, upright, around the origin.
+"""Coordinate frame of the subject, in which stages work: metres, upright, subject at the origin.
 
-Photographs come with any unit and any origin. In float32 a world 1 km away costs 0.1 mm, limits in
-metres mean nothing in millimetres, and an axis-aligned box depends on the world's axes. So the
-cameras of a batch are moved, turned and scaled, and its prediction is moved back, both by a frame
-in float64. :meth:`Frame.of` and :meth:`Frame.enter` have no gradient."""
+The world of a capture has any unit and origin. In float32 an origin 1 km away costs 0.1 mm, limits
+in metres are meaningless in a world in millimetres, and an axis-aligned box depends on the world's
+axes. So a rigid motion and a scale, both in float64, take the cameras of a batch into the frame and
+its prediction back to the world. :meth:`Frame.of` and :meth:`Frame.enter` have no gradient."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -30,9 +30,13 @@ HEIGHT = 1.8
 
 @dataclass(frozen=True)
 class Frame:
-    """``world = origin + metre * axes^T point`` for the points of each element, in float64. Axes:
-    right, up (the mean of all cameras) and back of the first camera. Origin: the subject's middle.
-    ``metre``: length of a metre of the frame in the world's unit."""
+    """Frame of each element: ``world = origin + metre * axes^T point``, in float64.
+
+    Attributes:
+        origin: the subject's centre in the world.
+        axes: rows are right, up (mean of all cameras) and back of the first camera.
+        metre: length of the frame's metre in the world's unit.
+    """
 
     origin: Float[Tensor, "B 3"]
     axes: Float[Tensor, "B 3 3"]
@@ -41,8 +45,8 @@ class Frame:
     @classmethod
     @torch.no_grad()
     def of(cls, batch: Batch) -> "Frame":
-        """The frame of each element, from its masks and cameras alone."""
-        # Neither autocast nor rounded products change float64.
+        """Compute the frame of each element from its masks and cameras."""
+        # Autocast and TF32 leave float64 products as they are.
         matrices = (batch.cameras.intrinsics.double(), batch.cameras.extrinsics.double())
         cameras = Cameras(*matrices, batch.cameras.height, batch.cameras.width)
         origin = subject_center(batch.masks, cameras)
@@ -50,20 +54,17 @@ class Frame:
 
     @property
     def shared(self) -> "Frame":
-        """One frame for all elements, which share a world: mean origin, first axes, median size."""
+        """One frame for all elements, which must share a world: mean origin, first axes, median
+        metre."""
         one = (self.origin.mean(0), self.axes[0], self.metre.median())
         return Frame(*(each.expand(len(self.metre), *each.shape) for each in one))
 
     @torch.no_grad()
     def enter(self, batch: Batch) -> Batch:
-        """The batch with its input cameras in the frame;
-        targets, true depths and bodies stay in the world.
+        """Move the input cameras of a batch from the world into the frame.
 
-        Args:
-            batch: with cameras in the world, of any unit.
-
-        Returns:
-            The batch; its cameras have the precision of the photographs, float32 or wider.
+        Targets, true depths and bodies stay in the world. The cameras returned have the dtype of
+        the images, float32 or wider.
         """
         cameras = batch.cameras
         dtype = at_least_float32(batch.images).dtype
@@ -75,14 +76,11 @@ class Frame:
         return dataclasses.replace(batch, cameras=inside)
 
     def leave_cameras(self, inside: Cameras, world: Cameras) -> Cameras:
-        """Cameras in the frame as cameras in the world.
+        """Move cameras from the frame to the world.
 
         Args:
-            inside: cameras in the frame, with the extrinsics [B, V, 4, 4] to convert.
-            world: the original cameras, which have the precision of the result.
-
-        Returns:
-            Cameras in the world.
+            inside: cameras in the frame, extrinsics [B, V, 4, 4].
+            world: the original cameras, whose dtypes the result has.
         """
         extrinsics = world.extrinsics.double().clone()
         extrinsics[..., :3, :3] = inside.extrinsics[..., :3, :3].double() @ self.axes[:, None]
@@ -94,19 +92,16 @@ class Frame:
         return dataclasses.replace(world, intrinsics=intrinsics, extrinsics=extrinsics.to(world.extrinsics))
 
     def in_world(self, dtype: torch.dtype) -> Float[Tensor, "B 4 3"]:
-        """Axes of each element in the world, as long as a metre, and its origin."""
+        """Axes of each element in the world, one metre long, and its origin, as four rows."""
         return torch.cat((self.metre[:, None, None] * self.axes, self.origin[:, None]), 1).to(dtype)
 
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
-        """The prediction in the world.
+        """Move a prediction from the frame to the world, in its unit and axes.
 
         Args:
             prediction: in the frame.
-            dtype: of points in the world (that of its cameras),
-                which may need more digits than in the frame.
-
-        Returns:
-            The prediction in the unit and the axes of the world.
+            dtype: dtype of points in the world (that of its cameras), float32 or wider: far from
+                the origin points need more digits.
         """
         dtype = torch.promote_types(dtype, torch.float32)
         views = prediction.depth.shape[1]
@@ -144,7 +139,7 @@ class Frame:
 
 
 def _in_unit(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tensor, Tensor]) -> DepthMaps:
-    """Maps in the world's unit; ``known`` caches results, since rounds share their bounds."""
+    """Scale depth maps to the world's unit; ``known`` caches results, since rounds share bounds."""
 
     def scaled(depth: Tensor) -> Tensor:
         if depth not in known:
@@ -158,15 +153,13 @@ def _in_unit(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tenso
 def to_world(
     points: Float[Tensor, "*n 3"], element: Int[Tensor, "*#n"], world: Float[Tensor, "B 4 3"]
 ) -> Float[Tensor, "*n 3"]:
-    """Points in the world, computed in its precision; the error is that of rounding the result.
+    """Move points from the frame to the world, in the dtype of ``world``, with no error but that of
+    rounding the result.
 
     Args:
         points: [..., 3] in the frame.
         element: batch element of each point, of a shape that broadcasts with [...].
-        world: axes of each element, as long as a metre, and its origin [B, 4, 3].
-
-    Returns:
-        Points [..., 3].
+        world: :meth:`Frame.in_world` [B, 4, 3].
     """
     *axes, result = world[element].unbind(-2)
     for coordinate, axis in zip(points.to(world.dtype)[..., None].unbind(-2), axes, strict=True):
@@ -175,15 +168,15 @@ def to_world(
 
 
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
-    """The point nearest to the rays through the masks' centroids, by least squares.
+    """Least-squares intersection of the rays through the masks' centroids.
 
-    Optical axes have a small weight, so that one mask or none is enough, and the cameras a smaller
-    one, for parallel rays. To be called where products are exact
-    (:func:`ghgs_lit.geometry.precision.exact`).
+    Optical axes enter with a small weight, so that one mask or none is enough, and the mean of the
+    camera centres with a smaller one, for parallel rays. Call it under
+    :func:`ghgs_lit.geometry.precision.exact`.
 
     Args:
         masks: of the subject [B, V, h, w].
-        cameras: [B, V], of photographs of that size.
+        cameras: [B, V], of images of that size.
 
     Returns:
         Points [B, 3] in the world.
@@ -207,7 +200,7 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
     origin = centers.mean(1)
     offsets = (centers - origin[:, None])[..., None]
     matrix = torch.add(across.sum(1), identity, alpha=1e-4)
-    # Never singular; linalg.solve would check that and wait for a GPU.
+    # Never singular; linalg.solve would check that with a device-to-host synchronisation.
     return torch.linalg.solve_ex(matrix, (across @ offsets).sum(1)).result[..., 0] + origin
 
 
@@ -215,18 +208,18 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
 def places_around(
     points: Float[Tensor, "*b n 3"], is_subject: Bool[Tensor, "*b n"]
 ) -> Float[Tensor, "*b n 3"]:
-    """Places of tokens around the middle of the subject, in units of its size.
+    """Positions of tokens relative to the subject's centre, in units of its size.
 
-    The middle is the mean of the subject's points, the unit their root mean square distance from
-    it, so that places depend neither on the world's origin nor on its unit.
+    The centre is the mean of the subject's points and the unit their root mean square distance from
+    it: positions depend neither on the world's origin nor on its unit.
 
     Args:
-        points: of the tokens of an element, or of several with the same number.
-        is_subject: which points lie on the subject; middle and unit are of these.
+        points: points of an element's tokens, or of several elements with the same number.
+        is_subject: which points lie on the subject; these define centre and unit.
 
     Returns:
-        Places, float32 or wider; 0 for points that are not finite,
-        or if all of the subject's coincide.
+        Positions, float32 or wider; 0 for points that are not finite, and if all points of the
+        subject coincide.
     """
     points = at_least_float32(points)
     is_finite = points.isfinite().all(-1)
@@ -240,32 +233,16 @@ def places_around(
 
 
 def in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
-    """One point of each element in the axes of all its cameras.
-
-    Args:
-        points: [B, 3] in the world.
-        extrinsics: world to camera [B, V, 4, 4].
-
-    Returns:
-        Points [B, V, 3].
-    """
+    """One point of each element in the coordinates of each of its cameras."""
     return world_to_camera(points[:, None].expand(*extrinsics.shape[:2], 3), extrinsics)
 
 
 def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> Float[Tensor, " B"]:
-    """Height or width of the subject, whichever is larger.
+    """Median over views of the subject's height or width (the larger) in the world's unit;
+    :data:`HEIGHT` if no view shows it in front of the camera.
 
-    The median of the views, so that one wrong mask does not matter; of two the larger, since masks
-    are more often too small.
-
-    Args:
-        masks: of the subject [B, V, h, w].
-        cameras: [B, V], of photographs of that size.
-        center: the subject's middle [B, 3].
-
-    Returns:
-        Lengths [B] in the world's unit; :data:`HEIGHT` if no view shows the subject in front of it.
-    """
+    The median tolerates one wrong mask; of two views the larger size counts, since masks are more
+    often too small than too large."""
     depth = in_cameras(center, cameras.extrinsics)[..., 2]
     sides = []
     for axis in (0, 1):
@@ -278,14 +255,15 @@ def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> F
 
 
 def _axes(cameras: Cameras) -> Float[Tensor, "B 3 3"]:
-    """Right, up and back as rows: proper rotations for any extrinsics."""
+    """Right, up and back as rows, a proper rotation for any extrinsics."""
     down = cameras.extrinsics[..., 1, :3]
     forward = cameras.extrinsics[:, 0, 2, :3]
     mean = -down.mean(1)
     # Without a common up direction: that of the first camera.
     up = unit(torch.where(mean.norm(dim=-1, keepdim=True) > 0.1, mean, -down[:, 0]))
 
-    # Made level. If the first camera looks straight up or down, its own up axis is horizontal.
+    # Project onto the horizontal plane. If the first camera looks straight up or down, its up axis
+    # lies in that plane.
     both = -torch.stack((forward, down[:, 0]))
     back, other = both - (both * up).sum(-1, keepdim=True) * up
     back = unit(torch.where(back.norm(dim=-1, keepdim=True) > 0.1, back, other))

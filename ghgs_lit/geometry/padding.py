@@ -1,5 +1,6 @@
-"""A black border around photographs whose sides are not multiples of the patch size. Predictions
-are cropped again, so that results are in the photograph's own pixels."""
+"""Padding of images whose sides are not multiples of the patch size.
+
+Predictions are cropped back to the pixels of the unpadded images."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -15,8 +16,8 @@ from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction,
 
 @dataclass(frozen=True)
 class Padding:
-    """Images of ``height`` x ``width`` with photographs of size ``full`` (height, width) inside.
-    Their first pixel is pixel (``top``, ``left``) of the photograph: 0 or negative."""
+    """Placement of images of size ``full`` (height, width) inside padded ones of ``height`` x
+    ``width``. The first padded pixel is pixel (``top``, ``left``) of the image: 0 or negative."""
 
     top: int
     left: int
@@ -25,23 +26,15 @@ class Padding:
     full: tuple[int, int]
 
     def pad(self, maps: Tensor, fill: float | bool = 0) -> Tensor:
-        """Maps of photographs with a border.
-
-        Args:
-            maps: [B, V, H, W, ...] of the photographs.
-            fill: value of the border.
-
-        Returns:
-            Maps [B, V, height, width, ...].
-        """
+        """Pad maps [B, V, H, W, ...] to [B, V, height, width, ...] with ``fill``."""
         return F.pad(maps, self._sides(maps), value=fill)
 
     def cut(self, maps: Tensor) -> Tensor:
-        """Maps without their border."""
+        """Crop padded maps [B, V, height, width, ...] to the size of the images."""
         return F.pad(maps, [-side for side in self._sides(maps)])
 
     def pad_batch(self, batch: Batch) -> "PaddedBatch":
-        """The batch with a border around every input; targets are unchanged."""
+        """Pad every input of a batch; targets are unchanged."""
         kept = {field.name: getattr(batch, field.name) for field in dataclasses.fields(Batch)}
         return dataclasses.replace(
             PaddedBatch(**kept, photographs=batch, padding=self),
@@ -53,7 +46,7 @@ class Padding:
         )
 
     def cut_prediction(self, prediction: Prediction) -> Prediction:
-        """The prediction of a padded batch in the pixels of the photographs."""
+        """Crop the prediction of a padded batch to the pixels of the images."""
         whole = self._cut_maps(prediction.depth_maps)
         pixels = self.cut(prediction.points.pixels)
         return dataclasses.replace(
@@ -74,33 +67,30 @@ class Padding:
         return dataclasses.replace(gaussians, pixel=self._cut_pixel(gaussians.pixel))
 
     def _cut_pixel(self, pixel: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-        """Indices of pixels of an image in that of its photograph."""
+        """Convert indices of pixels within a padded image to those within the image."""
         row = pixel // self.width + self.top
         column = pixel % self.width + self.left
         return row * self.full[1] + column
 
     def cut_pixels(self, pixels: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-        """Indices of pixels among those of all images, as indices among those of all photographs.
+        """Convert flat pixel indices over all padded images to those over all unpadded images.
 
         Args:
-            pixels: that lie within the photographs [n].
-
-        Returns:
-            Indices [n].
+            pixels: indices [n] of pixels outside the padding.
         """
         image = pixels // (self.height * self.width)
         pixel = pixels % (self.height * self.width)
         return image * (self.full[0] * self.full[1]) + self._cut_pixel(pixel)
 
     def cut_extent(self, extent: Extent) -> Extent:
-        """The extent of a mask, or of a window around it, without its border."""
+        """Clip the extent of a padded mask, or of a window around it, to the pixels of the image."""
         height, width = self.full
         rows = (min(max(row + self.top, 0), height) for row in extent[1:3])
         columns = (min(max(column + self.left, 0), width) for column in extent[3:])
         return Extent(extent.count, *rows, *columns)
 
     def _sides(self, maps: Tensor) -> list[int]:
-        """Widths of the border in the order of ``F.pad``: last axis first, before and after."""
+        """Widths of the padding in the order of ``F.pad``: last axis first, before and after."""
         below = self.height - self.full[0] + self.top
         right = self.width - self.full[1] + self.left
         return [0, 0] * (maps.dim() - 4) + [-self.left, right, -self.top, below]
@@ -108,7 +98,7 @@ class Padding:
 
 @dataclass(frozen=True)
 class PaddedBatch(Batch):
-    """Photographs with a border, and the batch without it."""
+    """Padded batch, together with the unpadded one (``photographs``)."""
 
     photographs: Batch | None = None
     padding: Padding | None = None
@@ -116,41 +106,37 @@ class PaddedBatch(Batch):
     def note(
         self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]], has_skew: bool
     ) -> None:
-        """Keep them for the photographs, too, in their own pixels."""
+        """Record them for the unpadded batch, too, in its pixels."""
         super().note(extents, pixels, has_skew)
         inner = [self.padding.cut_extent(extent) for extent in extents]
         self.photographs.note(inner, lambda: self.padding.cut_pixels(self.pixels), has_skew)
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds of all pixels, from the photographs without their border,
-    which would look like background.
+    """Depth bounds of a batch, computed from its unpadded images: padding would count as background.
 
     Args:
-        stage: gives the bounds of a batch, or None.
+        stage: computes the bounds of a batch, or None.
         batch: padded or not.
 
     Returns:
-        Bounds of the pixels of ``batch``; depths in a border have no meaning.
+        Bounds of the pixels of ``batch``; depths in the padding have no meaning.
     """
     if not isinstance(batch, PaddedBatch):
         return stage(batch)
-    bounds = stage(batch.photographs)  # depths in the border have no meaning
+    bounds = stage(batch.photographs)
     return bounds and map_tensors(bounds, lambda depths: batch.padding.pad(depths, 1.0))
 
 
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
-    """The smallest border that makes both sides multiples;
-    an odd pixel goes to the bottom and the right.
+    """Smallest padding that makes both sides multiples, or None if they are.
 
-    512 becomes 518 with 3 pixels on each side, as in the authors' release.
+    An odd pixel goes to the bottom and the right. 512 becomes 518 with 3 pixels on each side, as in
+    the authors' release.
 
     Args:
-        masks: [B, V, H, W], of which the size is read.
+        masks: [B, V, H, W]; only the size matters.
         multiple: side of a patch in pixels.
-
-    Returns:
-        The border; None if both sides are multiples.
     """
     height, width = masks.shape[2:]
     missing = (-height % multiple, -width % multiple)

@@ -1,4 +1,4 @@
-"""Precision: half precision for products of networks, float32 for geometry and last projections."""
+"""Precision: half precision for matrix products of networks, float32 for geometry and last layers."""
 
 import warnings
 from collections.abc import Hashable, Iterator
@@ -16,8 +16,7 @@ PRECISIONS = ("inherit", "float32", "tf32", "bfloat16", "float16", "auto")
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether the device has bfloat16 instructions;
-    without them bfloat16 is slower than float32."""
+    """Whether the device has bfloat16 instructions; without them bfloat16 is slower than float32."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if device.type == "cpu" else {}
@@ -25,12 +24,12 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
-    """Dtype to use for weights: float32 instead of a half precision that the processor lacks.
+    """Dtype to load weights in: float32 instead of a half precision that the processor lacks.
 
-    On a CPU float16 takes four times as long as float32, and loses digits.
+    On a CPU, float16 takes four times as long as float32 and loses digits.
 
     Args:
-        stored: dtype of the weights as they are stored.
+        stored: dtype of the stored weights.
         device: where they are used.
     """
     if device.type == "cpu" and (
@@ -41,18 +40,18 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
 
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
-    """The context of a forward pass in a precision.
+    """Context manager for a forward pass in the precision ``name``.
 
     Args:
-        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but where convolutions round to
-            TF32, as PyTorch has it on CUDA, products do, too, which is said once; ``float32``:
-            :func:`exact`; ``tf32``: all products and convolutions; ``auto``: bfloat16 if the device
-            has it, else float16 on CUDA and float32 on a CPU.
-        device: where the pass is.
+        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but with PyTorch's default on CUDA
+            (TF32 in convolutions alone) products use TF32, too, with one warning; ``float32``:
+            :func:`exact`; ``tf32``: TF32 in all products and convolutions; ``auto``: bfloat16 if
+            the device has it, else float16 on CUDA and float32 on a CPU.
+        device: device of the pass.
 
     Raises:
-        InputError: an unknown precision, TF32 or float16 on a CPU,
-            or bfloat16 on a device without it.
+        InputError: for an unknown precision, TF32 or float16 on a CPU, or bfloat16 on a device
+            without it.
     """
     choice("precision", name, PRECISIONS)
     if name == "inherit":
@@ -68,16 +67,14 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
 
 
 def bfloat16_where_possible(device: torch.device) -> AbstractContextManager:
-    """Products in bfloat16 where the device has it; elsewhere the caller's precision."""
+    """Autocast to bfloat16 where the device has it; elsewhere the caller's precision."""
     return torch.autocast(device.type, torch.bfloat16) if has_bfloat16(device) else nullcontext()
 
 
 def half_precision(name: str, device: torch.device) -> torch.dtype | None:
-    """The half precision of products; None: float32.
+    """Half precision of products for a precision of :data:`PRECISIONS`; None: float32.
 
-    Args:
-        name: one of :data:`PRECISIONS`, as for :func:`precision_of`.
-        device: where the products are; it decides for ``auto``.
+    ``device`` matters for ``auto`` alone.
     """
     if name == "auto":
         slow = "float16" if device.type == "cuda" else "float32"
@@ -86,21 +83,22 @@ def half_precision(name: str, device: torch.device) -> torch.dtype | None:
 
 
 def exact(device: str) -> AbstractContextManager[None]:
-    """Full float32: no autocast, and no products or convolutions with rounded factors.
+    """Full float32: no autocast, and no rounding of factors in products and convolutions.
 
-    Factors are rounded to TF32 or bfloat16 where ``torch.set_float32_matmul_precision`` allows it,
-    and in convolutions on CUDA by PyTorch's default (TF32 has 11 bits: 1 mm at 2 m).
+    Factors are otherwise rounded to TF32 or bfloat16 if ``torch.set_float32_matmul_precision``
+    allows it, and by default in convolutions on CUDA (TF32 has 11 bits: 1 mm at 2 m).
 
     Args:
-        device: its type, ``cpu`` or ``cuda``.
+        device: type of the device, ``cpu`` or ``cuda``.
     """
     return _float32(device, rounding=False)
 
 
 @contextmanager
 def _inherited() -> Iterator[None]:
-    """The caller's precision on CUDA. PyTorch's default rounds factors of convolutions to TF32, but
-    not those of products: slower, and no more accurate as a whole."""
+    """The caller's precision on CUDA, with TF32 products if PyTorch's default is active.
+
+    That default uses TF32 in convolutions but not in products: slower, and no more accurate overall."""
     before = _Rounding.now("cuda")
     if not before.is_default:
         yield
@@ -124,12 +122,7 @@ def _say_rounding() -> None:
 
 @contextmanager
 def _float32(device: str, rounding: bool) -> Iterator[None]:
-    """Full float32 or TF32 while the context lasts, without autocast.
-
-    Args:
-        device: its type.
-        rounding: whether factors are rounded to TF32.
-    """
+    """Disable autocast and, with ``rounding``, use TF32, else full float32."""
     before = _Rounding.now(device)
     changes = rounding or before.is_any
     if changes:
@@ -143,12 +136,12 @@ def _float32(device: str, rounding: bool) -> Iterator[None]:
 
 
 def round_products(rounding: bool, device: str = "cuda", also_older: bool = True) -> None:
-    """Whether products and convolutions of float32 numbers round their factors to TF32 from now on.
+    """Set whether float32 products and convolutions round their factors to TF32.
 
     Args:
-        rounding: whether they do.
-        device: its type, ``cpu`` or ``cuda``.
-        also_older: by the switches that PyTorch had before 2.9, too.
+        rounding: True: TF32; False: full float32.
+        device: type of the device, ``cpu`` or ``cuda``.
+        also_older: also set the switches that PyTorch had before 2.9.
     """
     if also_older:
         torch.set_float32_matmul_precision("high" if rounding else "highest")
@@ -158,26 +151,25 @@ def round_products(rounding: bool, device: str = "cuda", also_older: bool = True
 
 
 def rounds_products(device: str) -> bool:
-    """Whether products or convolutions of float32 numbers round their factors now on a
-    type of device."""
+    """Whether float32 products or convolutions currently round their factors on a type of device."""
     return _Rounding.now(device).is_any
 
 
 def rounding_state(device: str) -> Hashable:
-    """The state of all switches that decide which products and convolutions round on a
-    type of device."""
+    """State of all of PyTorch's switches for rounding on a type of device, as a key of caches."""
     now = _Rounding.now(device)
     return tuple(now.of_modules), now.of_older
 
 
 @dataclass(frozen=True)
 class _Rounding:
-    """State of PyTorch's switches.
+    """State of PyTorch's switches for rounding.
 
     Attributes:
         of_modules: ``fp32_precision`` of :func:`_modules`.
-        of_older: for products, and for convolutions on CUDA; None where PyTorch refuses to read
-            them, since newer ones were set to what these cannot express.
+        of_older: switches before PyTorch 2.9, for products and for convolutions on CUDA; None where
+            PyTorch raises on reading them, because the newer ones hold a state that they cannot
+            express.
     """
 
     of_modules: list[str]
@@ -201,8 +193,7 @@ class _Rounding:
 
     @property
     def is_default(self) -> bool:
-        """Whether convolutions on CUDA round and products do not,
-        as PyTorch has it and nobody chooses it."""
+        """Whether convolutions on CUDA round and products do not: PyTorch's default."""
         if self.of_older != ("highest", True):
             return False
         return not self.of_modules or (
@@ -219,8 +210,8 @@ class _Rounding:
 
 @cache
 def _modules(device: str) -> list[Any]:
-    """What decides whether products and convolutions round on a type of device,
-    in PyTorch 2.9 and later."""
+    """Backends whose ``fp32_precision`` controls rounding on a type of device, in PyTorch 2.9 and
+    later; products first."""
     matmul = torch.backends.cuda.matmul
     cudnn = torch.backends.cudnn
     mkldnn = torch.backends.mkldnn
@@ -233,11 +224,10 @@ def _modules(device: str) -> list[Any]:
 
 
 def keep_rounded(module: nn.Module, dtype: torch.dtype) -> None:
-    """Store weights of linear layers and convolutions in the half precision that autocast
-    rounds them to.
+    """Store weights of linear layers and convolutions in the half precision of autocast.
 
-    Autocast does so at every call; these are the same numbers in half the memory, without a kernel
-    for each weight. From then on the module runs under autocast to ``dtype`` alone.
+    Autocast casts them at every call: this gives the same values in half the memory, without a
+    kernel per weight. Afterwards the module runs under autocast to ``dtype`` only.
 
     Args:
         module: changed in place.
@@ -249,7 +239,7 @@ def keep_rounded(module: nn.Module, dtype: torch.dtype) -> None:
 
 
 def without_float16(device: str) -> AbstractContextManager:
-    """Turn off float16 autocast on a type of device:
-    maps and gradients of dense heads overflow in it."""
+    """Disable float16 autocast on a type of device: activations and gradients of dense heads
+    overflow in it."""
     low = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
     return torch.autocast(device, enabled=False) if low else nullcontext()

@@ -1,5 +1,6 @@
-"""Projection, unprojection and bilinear sampling. Conventions: see :mod:`ghgs_lit.types`. Every
-function takes any leading dimensions and computes in float32 or wider under any autocast."""
+"""Projection, unprojection and bilinear sampling, with the conventions of :mod:`ghgs_lit.types`.
+
+Functions accept any leading dimensions and compute in float32 or wider under any autocast."""
 
 import torch
 import torch.nn.functional as F
@@ -11,35 +12,20 @@ from ghgs_lit.types import Cameras
 
 
 def at_least_float32(tensor: Tensor) -> Tensor:
-    """``tensor`` in float32 or wider, the precision of all geometry."""
+    """Return ``tensor`` in float32 or wider, the precision of all geometry."""
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
 def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2"]:
-    """Centres ``(u, v)`` of the pixels of an image.
+    """Centres ``(u, v)`` of an image's pixels [h, w, 2], with the device and the dtype of ``like``.
 
-    Args:
-        height: of the image in pixels, as is the next.
-        width: of the image.
-        like: has the device and the dtype.
-
-    Returns:
-        [h, w, 2], never to be changed (:func:`ghgs_lit.geometry.constants.constant`).
+    The tensor is shared (:func:`ghgs_lit.geometry.constants.constant`): never change it in place.
     """
     return homogeneous_centers(height, width, like)[..., :2]
 
 
 def homogeneous_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 3"]:
-    """Centres ``(u, v, 1)`` of the pixels of an image.
-
-    Args:
-        height: of the image in pixels, as is the next.
-        width: of the image.
-        like: has the device and the dtype.
-
-    Returns:
-        [h, w, 3], never to be changed (:func:`ghgs_lit.geometry.constants.constant`).
-    """
+    """:func:`pixel_centers` in homogeneous coordinates ``(u, v, 1)`` [h, w, 3]; shared as well."""
     return constant(_centers, height, width, like=like)
 
 
@@ -91,7 +77,7 @@ def unproject(
     y = y * depth - shift[..., 1]
     z = depth - shift[..., 2]
     # The product with R^T is written out: matmul would run in half precision under autocast, and
-    # this way there is no temporary of nine numbers for each pixel.
+    # broadcasting would allocate nine numbers per pixel.
     rows = extrinsics[..., :3, :3].unbind(-2)
     return torch.stack(
         [x * rows[0][..., k] + y * rows[1][..., k] + z * rows[2][..., k] for k in range(3)], -1
@@ -99,17 +85,7 @@ def unproject(
 
 
 def _unproject_in_few_steps(pixels: Tensor, depth: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
-    """:func:`unproject` in fewer launches of a GPU, with more temporaries.
-
-    Args:
-        pixels: as for :func:`unproject`, but float32 or wider, as are the next.
-        depth: z in the camera.
-        intrinsics: K.
-        extrinsics: world to camera.
-
-    Returns:
-        Points [..., 3].
-    """
+    """:func:`unproject` with fewer GPU launches but more temporaries; all inputs float32 or wider."""
     offset = pixels - intrinsics[..., :2, 2]
     y = offset[..., 1] / intrinsics[..., 1, 1]
     x = (offset[..., 0] - intrinsics[..., 0, 1] * y) / intrinsics[..., 0, 0]
@@ -126,7 +102,7 @@ def unproject_maps(
     Args:
         depth: z in the camera [..., h, w], in the unit of the world.
         cameras: with the leading dimensions of ``depth``.
-        pixels: where the depths are [..., h, w, 2]; None: at the centres of all pixels.
+        pixels: ``(u, v)`` of each depth [..., h, w, 2]; None: centres of all pixels.
 
     Returns:
         Points [..., h, w, 3], float32 or wider.
@@ -146,7 +122,7 @@ def focal_lengths(cameras: Cameras) -> Float[Tensor, "*batch 2"]:
 def world_to_camera(
     points: Float[Tensor, "*batch 3"], extrinsics: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*batch 3"]:
-    """World points in camera axes, ``R x + t``.
+    """Transform world points to camera coordinates: ``R x + t``.
 
     Args:
         points: [..., 3] in the world.
@@ -159,8 +135,8 @@ def world_to_camera(
 
 
 def _affine(matrices: Tensor, points: Tensor) -> Tensor:
-    """``A x + b`` of points [c, ...] for matrices ``[A b]`` [..., r, c + 1], as [r, ...]; no product of
-    matrices, as in :func:`unproject`. On a CPU without a temporary of all products; elsewhere at once."""
+    """``A x + b`` [r, ...] of points [c, ...] for matrices ``[A b]`` [..., r, c + 1], without matmul
+    (see :func:`unproject`); column by column on a CPU, to save temporaries, else in one sum."""
     matrices = at_least_float32(matrices)
     points = at_least_float32(points)
     columns = matrices[(None,) * (points.dim() + 1 - matrices.dim())].movedim((-1, -2), (0, 1))
@@ -178,7 +154,7 @@ def project(
     intrinsics: Float[Tensor, "*#batch 3 3"],
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
-    """Pixels and depths of world points.
+    """Project world points to pixels and depths.
 
     Args:
         points: [..., 3] in the world.
@@ -186,7 +162,7 @@ def project(
         extrinsics: world to camera [..., 4, 4].
 
     Returns:
-        Pixels ``(u, v)`` [..., 2], which are meaningless where z <= 0, and depths z [...].
+        Pixels ``(u, v)`` [..., 2], meaningless where z <= 0, and depths z [...].
     """
     inside = _affine(extrinsics[..., :3, :], points.movedim(-1, 0))
     z = inside[2]
@@ -200,14 +176,12 @@ def look_at_point(cameras: Cameras) -> Tensor:
 
 
 def meeting_point(centers: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """The point nearest to all rays (least squares).
+    """Least-squares intersection [3] of lines; of parallel ones, the solution nearest to the mean of
+    ``centers``.
 
     Args:
-        centers: points of the rays, in float64.
-        directions: of the rays, unit vectors.
-
-    Returns:
-        Point [3]; for parallel rays, the solution nearest to the mean of the centres.
+        centers: a point of each line, in float64.
+        directions: unit vectors.
     """
     middle = centers.mean(0)
     identity = torch.eye(3, dtype=centers.dtype, device=centers.device)
@@ -219,21 +193,21 @@ def meeting_point(centers: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"
 def sample(
     maps: Float[Tensor, "m c H W"], image: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]
 ) -> Float[Tensor, "*n c"]:
-    """Bilinear values of maps at pixels of any of them.
+    """Sample maps bilinearly, each pixel from a map of its own.
 
     Args:
-        maps: m maps of one size [m, c, H, W]; all must be finite: by rounding, the next map may
-            enter with a tiny weight.
-        image: number of the map of each pixel [...].
+        maps: m maps of one size [m, c, H, W], all finite: through rounding, a neighbouring map may
+            contribute with a tiny weight.
+        image: index of the map of each pixel [...].
         pixels: ``(u, v)`` [..., 2].
 
     Returns:
-        Values [..., c]; 0 outside.
+        Values [..., c]; 0 outside the map.
     """
     count, _, height, width = maps.shape
     u, v = pixels.unbind(-1)
-    # The maps are the layers of a volume, and pixels lie in the middle of a layer. Pixels far
-    # outside are clamped: large numbers are not exact.
+    # One trilinear lookup: the maps are layers of a volume, and each pixel lies at the centre of its
+    # layer. Pixels far outside are clamped, since large coordinates lose precision.
     layer = (2 * image.to(pixels) + 1) / count - 1
     grid = torch.stack(((2 / width * u - 1).clamp(-3, 3), (2 / height * v - 1).clamp(-3, 3), layer), -1)
     grid = grid.reshape(1, 1, 1, -1, 3)

@@ -1,6 +1,7 @@
 """Directions, quaternions ``(w, x, y, z)``, rotation matrices, and small motions of cameras.
-Photographs show neither where a rig as a whole is nor how far its cameras are from a subject of
-unknown size: they only determine motions of the cameras relative to one another."""
+
+Images determine neither the pose of a rig as a whole nor its distance from a subject of unknown
+size: only relative motions of the cameras are observable."""
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +15,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions of any norm.
 
-    Quaternions are first scaled by their largest component: norms of 1e-30 or 1e30 are valid.
+    Quaternions are first divided by their largest component: norms of 1e-30 or 1e30 are valid.
 
     Args:
         quaternions: ``(w, x, y, z)`` [..., 4]; the zero quaternion gives the identity.
@@ -38,8 +39,8 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-#: The 16 values of Shepperd's table as sums of at most four numbers with signs. 0 is the number 1;
-#: entries of the matrix are numbered from 1, by row.
+#: The 16 values of Shepperd's table as sums of at most four signed numbers. Index 0 is the constant
+#: 1; entries of the matrix are indexed from 1, by row.
 _OWN = (0, 1, 5, 9)
 _X = (8, 6, 0, 0)
 _Y = (3, 7, 0, 0)
@@ -56,7 +57,7 @@ _TABLE_SIGNS = (
 
 
 def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternions of rotation matrices (Shepperd 1978).
+    """Unit quaternions of rotation matrices (Shepperd, 1978).
 
     Args:
         matrices: proper rotations [..., 3, 3].
@@ -72,7 +73,7 @@ def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
 
 
 def _signed(numbers: Float[Tensor, "*batch n"], places: tuple, signs: tuple) -> Float[Tensor, "*batch r 4"]:
-    """The numbers at ``places`` (rows of four) times ``signs``."""
+    """Gather the numbers at ``places`` (rows of four) and multiply them by ``signs``."""
     index = constant(torch.tensor, sum(places, ()), like=numbers, dtype=torch.long)
     chosen = numbers.index_select(-1, index).unflatten(-1, (-1, 4))
     return chosen * constant(torch.tensor, signs, like=numbers)
@@ -81,22 +82,15 @@ def _signed(numbers: Float[Tensor, "*batch n"], places: tuple, signs: tuple) -> 
 def rotate(
     quaternions: Float[Tensor, "*batch 4"], vectors: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Vectors rotated by quaternions, in a fifth of the time of a product with matrices.
-
-    Args:
-        quaternions: ``(w, x, y, z)`` of norm 1 [..., 4].
-        vectors: [..., 3].
-
-    Returns:
-        Vectors [..., 3].
-    """
+    """Rotate vectors by unit quaternions ``(w, x, y, z)``, in a fifth of the time of matrix
+    products."""
     axis = quaternions[..., 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + quaternions[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
-#: Components of the second quaternion by which those of the first are multiplied, and signs of the
-#: products: for z, y, x and w of the result, in whose order gradients are summed.
+#: For z, y, x and w of a product (the order in which gradients are summed): components of the second
+#: quaternion that multiply w, x, y, z of the first, and the signs of these products.
 _FACTORS = ((3, 2, 1, 0), (2, 3, 0, 1), (1, 0, 3, 2), (0, 1, 2, 3))
 _FACTOR_SIGNS = ((1, 1, -1, 1), (1, -1, 1, 1), (1, 1, 1, -1), (1, -1, -1, -1))
 
@@ -104,31 +98,22 @@ _FACTOR_SIGNS = ((1, 1, -1, 1), (1, -1, 1, 1), (1, 1, 1, -1), (1, -1, -1, -1))
 def multiply_quaternions(
     first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """The products ``first second``: rotate by ``second``, then by ``first``.
+    """Hamilton product ``first second``: the rotation by ``second``, then by ``first``.
 
-    Args:
-        first: ``(w, x, y, z)`` [..., 4] of any norm.
-        second: the same.
-
-    Returns:
-        Quaternions [..., 4], whose norms are the products of the norms.
+    Quaternions are ``(w, x, y, z)`` of any norm; norms multiply.
     """
     return (first[..., None, :] * _signed(second, _FACTORS, _FACTOR_SIGNS)).sum(-1).flip(-1)
 
 
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
-    """Vectors divided by their length; 0 stays 0, with a zero gradient.
+    """Normalise vectors to unit length, in float32 or wider; 0 stays 0, with a zero gradient.
 
-    Vectors are first scaled by their largest component: squares of 1e-20 vanish in float32, those
-    of 1e20 overflow.
+    Vectors are first divided by their largest component: in float32, squares of 1e-20 vanish and
+    those of 1e20 overflow.
 
     Args:
         x: vectors [..., c].
-        least: the gradient, which grows as 1 / length,
-            stays constant for vectors shorter than this.
-
-    Returns:
-        Vectors [..., c], float32 or wider.
+        least: length below which the gradient, which grows as 1 / length, stays constant.
     """
     x = at_least_float32(x)
     largest = torch.linalg.vector_norm(x.detach(), torch.inf, -1, keepdim=True)
@@ -146,22 +131,22 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     return direction.detach() + share * (direction - direction.detach())
 
 
-#: Relative weight of a shift along an optical axis: it is hardly visible,
-#: much like another focal length.
+#: Relative weight of a translation along the optical axis, which is hardly visible (it resembles a
+#: change of focal length).
 _ALONG = 0.01
 
 
 def without_common(
     motions: Float[Tensor, "*b V 6"], axes: Float[Tensor, "*b V 3"]
 ) -> Float[Tensor, "*b V 6"]:
-    """Motions without their mean, and without the mean of their shifts along the optical axes.
+    """Remove the motion common to all cameras: the mean, and the mean shift along optical axes.
 
-    The mean of the shifts leaves the least shifts across the optical axes (least squares).
+    The mean shift is the one that minimises the remaining shifts across the optical axes (least
+    squares).
 
     Args:
-        motions: rotation vectors of points, in radians, and shifts [..., V, 6],
-            in the world's axes.
-        axes: optical axes of the cameras [..., V, 3], unit vectors of the world.
+        motions: rotation vectors of points, in radians, and shifts [..., V, 6], in world axes.
+        axes: optical axes of the cameras [..., V, 3], unit vectors in the world.
 
     Returns:
         Motions [..., V, 6].
@@ -169,7 +154,7 @@ def without_common(
     turn, shift = motions.split(3, -1)
     turn = turn - turn.mean(-2, keepdim=True)
     across = torch.eye(3).to(axes) - (1 - _ALONG) * axes[..., :, None] * axes[..., None, :]
-    # Products written out: matmul would run in half precision under autocast.
+    # Written out: matmul would run in half precision under autocast.
     mean = torch.linalg.solve(across.sum(-3), (across * shift[..., None, :]).sum((-3, -1)))
     shift = shift - mean[..., None, :]
     along = (shift * axes).sum(-1, keepdim=True).mean(-2, keepdim=True)
@@ -179,11 +164,11 @@ def without_common(
 def rigid(
     motions: Float[Tensor, "*n 6"], length: float = 1.0
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-    """Rotations and shifts of small motions.
+    """Rotation matrices and translations of small motions.
 
     Args:
         motions: rotation vectors in radians, and shifts in units of ``length``, [..., 6].
-        length: in the unit of the world.
+        length: unit of the shifts, in the unit of the world.
 
     Returns:
         Rotation matrices [..., 3, 3], exact to second order in the angles, and shifts [..., 3] in
@@ -196,13 +181,13 @@ def rigid(
 def motions_between(
     before: Float[Tensor, "V 4 4"], after: Float[Tensor, "V 4 4"], middle: Float[Tensor, "3"]
 ) -> Float[Tensor, "V 6"]:
-    """Small motions about ``middle`` after which ``before`` sees points as ``after``
-    sees them unmoved.
+    """Small motions of the world about ``middle`` that are equivalent to replacing the extrinsics
+    ``before`` by ``after``; the inverse of :func:`after_motions`.
 
     Args:
         before: extrinsics [V, 4, 4].
-        after: extrinsics [V, 4, 4] that differ from them by small angles.
-        middle: point [3] of the world.
+        after: extrinsics [V, 4, 4] that differ by small angles.
+        middle: centre of the rotations [3], in the world.
 
     Returns:
         Rotation vectors in radians, and shifts in the unit of the world, [V, 6].
@@ -211,7 +196,7 @@ def motions_between(
     turn = back @ after[:, :3, :3]
     turn = (turn - turn.mT) / 2
     vector = torch.stack((turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]), -1)
-    # Differences first: far from the world's origin the two sums are large.
+    # Differences first: far from the world's origin both terms are large and would cancel.
     seen = (after - before)[:, :3, :3] @ middle + (after - before)[:, :3, 3]
     return torch.cat((vector, (back @ seen[..., None])[..., 0]), -1)
 
@@ -222,13 +207,13 @@ def after_motions(
     middle: Float[Tensor, "3"],
     length: float = 1.0,
 ) -> Float[Tensor, "*n 4 4"]:
-    """Cameras that see points as ``extrinsics`` sees them after :func:`rigid` motions.
+    """Compose extrinsics with :func:`rigid` motions of the world, applied before them.
 
     Args:
         extrinsics: world to camera [..., 4, 4].
         motions: rotation vectors in radians, and shifts in units of ``length``, [..., 6].
-        middle: point [3] of the world that motions turn about.
-        length: in the unit of the world.
+        middle: centre of the rotations [3], in the world.
+        length: unit of the shifts, in the unit of the world.
 
     Returns:
         Extrinsics [..., 4, 4].

@@ -1,7 +1,8 @@
-"""Silhouette coherence: how much of each mask lies in the visual hull of the others. With correct
-cameras and masks, the ray of every mask pixel passes a point that all other masks cover (Boyer
-2006; Hernandez, Schmitt and Cipolla 2007). For silhouettes of any sizes, unlike
-:mod:`ghgs_lit.method.bounds.agreement`."""
+"""Silhouette coherence: how much of each mask is explained by the visual hull of the others.
+
+With correct cameras and masks, the ray of every mask pixel passes through a point that all other
+masks cover (Boyer, 2006; Hernandez, Schmitt and Cipolla, 2007). Silhouettes may differ in size, unlike
+in :mod:`ghgs_lit.method.bounds.agreement`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +13,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A mask of cells with its camera. ``mask``: [h, w] bool, true where any pixel of a cell is.
-    ``intrinsics``: [3, 3] float64, in cells. ``extrinsics``: [4, 4] float64."""
+    """A mask at the resolution of cells (blocks of pixels) with its camera.
+
+    Attributes:
+        mask: [h, w] bool, True where any pixel of a cell is.
+        intrinsics: [3, 3] float64, in cells.
+        extrinsics: world to camera [4, 4] float64.
+    """
 
     mask: np.ndarray
     intrinsics: np.ndarray
@@ -21,7 +27,7 @@ class Silhouette:
 
     @property
     def center(self) -> np.ndarray:
-        """The camera's centre [3] in the world."""
+        """Centre of the camera [3] in the world."""
         return -self.extrinsics[:3, :3].T @ self.extrinsics[:3, 3]
 
     @cached_property
@@ -33,12 +39,13 @@ class Silhouette:
         return np.logical_or.reduce(list(shifts))
 
     def rays(self, cells: np.ndarray) -> np.ndarray:
-        """World directions [n, 3] per unit of z-depth, through ``cells`` [n, 2] (column, row)."""
+        """Directions [n, 3] in the world, per unit of depth z, of rays through ``cells`` [n, 2]
+        (column, row)."""
         local = np.concatenate((cells, np.ones((len(cells), 1))), 1) @ np.linalg.inv(self.intrinsics).T
         return local @ self.extrinsics[:3, :3]
 
     def depths_around(self, point: np.ndarray, reach: float, count: int) -> np.ndarray:
-        """Depths along rays, evenly spaced in front of and behind a point.
+        """Evenly spaced depths around the depth of a point.
 
         Args:
             point: [3] in the world.
@@ -46,22 +53,17 @@ class Silhouette:
             count: number of depths.
 
         Returns:
-            The positive ones of ``count`` z-depths, ascending.
+            The positive ones of ``count`` depths z, ascending.
         """
         middle = (self.extrinsics[:3, :3] @ point + self.extrinsics[:3, 3])[2]
         depths = middle + reach * np.linspace(-1, 1, count)
         return depths[depths > 0]
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Whether world points lie in the dilated mask; false behind the camera.
+        """Whether world points [..., 3] project into the dilated mask; False behind the camera.
 
-        Outside the frame the nearest border cell counts: a mask that touches the border goes on.
-
-        Args:
-            points: [..., 3] in the world.
-
-        Returns:
-            Bools [...].
+        Outside the frame the nearest border cell counts, since a subject that touches the border
+        continues beyond it.
         """
         local = points @ self.extrinsics[:3, :3].T + self.extrinsics[:3, 3]
         z = local[..., 2]
@@ -73,14 +75,8 @@ class Silhouette:
         return self.grown[row, column] & (z > 0)
 
     def extent(self, focus: np.ndarray) -> np.ndarray:
-        """Size of the mask at the depth of a point.
-
-        Args:
-            focus: point [3] of the world.
-
-        Returns:
-            Height and width [2] in the unit of the world; 0 for an empty mask.
-        """
+        """Height and width [2] of the mask at the depth of ``focus`` [3], in the unit of the world; 0
+        for an empty mask."""
         rows, columns = np.nonzero(self.mask)
         cells = np.array([np.ptp(rows) + 1, np.ptp(columns) + 1]) if len(rows) else np.zeros(2)
         depth = abs((self.extrinsics[:3, :3] @ focus + self.extrinsics[:3, 3])[2])
@@ -91,21 +87,21 @@ class Silhouette:
 class HullSearch:
     """Precision of a search for the visual hull."""
 
-    rays: int = 300  # largest number of cells of a mask that are tried
+    rays: int = 300  # largest number of cells per mask
     depths: int = 96  # points along each ray
-    reach: float = 1.25  # range of depths around the subject's middle, in radii of the subject
+    reach: float = 1.25  # range of depths around the subject's centre, in radii of the subject
     # largest number of other silhouettes that a ray is compared with; None: all
     others: int | None = None
-    wrong: float = 0.0  # share of these that may say "outside"
+    wrong: float = 0.0  # fraction of these that need not cover a point of the hull
 
     def shares(self, silhouettes: Sequence[Silhouette]) -> list[float]:
-        """The share of each silhouette's cells whose rays meet the visual hull of the others.
+        """Fraction of each silhouette's cells whose rays meet the visual hull of the others.
 
         Args:
             silhouettes: of one subject at one instant.
 
         Returns:
-            A share in [0, 1] for each silhouette; 0 if it is empty.
+            A fraction in [0, 1] per silhouette; 0 if it is empty.
         """
         count = len(silhouettes) if self.others is None else self.others + 1
         spread = np.unique(np.linspace(0, len(silhouettes) - 1, count).round().astype(int))
@@ -127,18 +123,15 @@ class HullSearch:
         focus: np.ndarray,
         radius: float,
     ) -> np.ndarray:
-        """Whether rays of one silhouette meet the hull of others.
+        """Whether each ray of one silhouette meets the visual hull of others.
 
         Args:
-            one: the silhouette whose rays these are.
-            cells: its cells that the rays pass [n, 2] (column, row);
-                the centre of the first is (0.5, 0.5).
-            others: the silhouettes of the hull; a share of :attr:`wrong` need not cover a point.
-            focus: the subject's middle [3] (:func:`subject_sphere`).
-            radius: of the subject, in the unit of the world.
-
-        Returns:
-            Bools [n].
+            one: the silhouette that the rays belong to.
+            cells: points in its mask that the rays pass through [n, 2] (column, row); the centre of
+                the first cell is (0.5, 0.5).
+            others: silhouettes of the hull; a fraction :attr:`wrong` of them need not cover a point.
+            focus: the subject's centre [3] (:func:`subject_sphere`).
+            radius: radius of the subject, in the unit of the world.
         """
         depths = one.depths_around(focus, self.reach * radius, self.depths)
         points = one.center + one.rays(cells)[:, None] * depths[:, None]
@@ -151,15 +144,12 @@ class HullSearch:
 
 
 def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
-    """Where the subject of silhouettes is, and how large.
+    """Centre [3] of the subject in the world, and an upper bound of its radius in the world's unit.
 
     Args:
         silhouettes: of one subject at one instant.
-
-    Returns:
-        Its middle [3] in the world, and an upper limit of its radius in the unit of the world.
     """
-    # Here, so that checks of paths do not wait for PyTorch.
+    # Imported late, so that checks of paths do not load PyTorch.
     import torch
 
     from ghgs_lit.geometry.projection import meeting_point

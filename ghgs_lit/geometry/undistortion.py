@@ -1,20 +1,20 @@
-"""Undistortion of photographs, as OpenCV's ``undistort`` and ``fisheye`` do,
-with kornia's models."""
+"""Undistortion of images with kornia's lens models, equivalent to OpenCV's ``undistort`` and
+``fisheye``."""
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-# Pixels between evaluations of the model; it is interpolated linearly, with errors below 0.01 px.
+# Pixels between evaluations of the model; linear interpolation in between has errors below 0.01 px.
 _STEP = 8
-_OUTSIDE = 4.0  # of a grid's positions, which are from -1 to 1 inside
-_RADII = 4096  # at which a lens is examined for where its model turns back
+_OUTSIDE = 4.0  # grid position outside the image, which spans -1 to 1
+_RADII = 4096  # number of radii at which a lens model is checked for monotonicity
 
 
 def undistorting_grid(
     intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int, fisheye: bool = False
 ) -> torch.Tensor:
-    """Where the pixels of the undistorted image are in the photograph.
+    """Sampling grid that maps pixels of the undistorted image to the distorted one.
 
     The formulas are those of OpenCV's camera model and of its fisheye model (Kannala and
     Brandt, PAMI 2006).
@@ -22,16 +22,16 @@ def undistorting_grid(
     Args:
         intrinsics: K [3, 3] in pixels, also of the undistorted image.
         distortion: k1 k2 p1 p2 and up to ten more of OpenCV's model; with ``fisheye`` k1 to k4.
-        height: of both images in pixels.
-        width: of both images in pixels.
+        height: height of both images in pixels.
+        width: width of both images in pixels.
         fisheye: whether the coefficients are those of the fisheye model.
 
     Returns:
-        Positions [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``; outside of
-        the photograph beyond the radius at which the model turns back, where it shows once more what
-        lies further inside.
+        Positions [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``. Beyond the
+        radius at which the model stops increasing, and would show parts of the image twice,
+        positions lie outside.
     """
-    # Here: importing kornia takes longer than reading photographs without distortion.
+    # Imported late: importing kornia takes longer than reading images without distortion.
     from kornia.geometry.calibration import distort_points
     from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
 
@@ -60,7 +60,7 @@ def undistorting_grid(
 
 
 def _range(distortion: np.ndarray, fisheye: bool, largest: float) -> float:
-    """The radius on the plane at depth 1 at which a lens model turns back; ``largest``: not below it."""
+    """Radius on the plane z = 1 up to which a lens model increases, at most ``largest``."""
     radii = np.linspace(0, largest, _RADII)
     k = np.zeros(14)
     k[: len(distortion)] = distortion
@@ -81,10 +81,10 @@ def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple
     Args:
         image: [h, w, 3] uint8.
         matte: [h, w] uint8.
-        grid: of :func:`undistorting_grid`.
+        grid: from :func:`undistorting_grid`.
 
     Returns:
-        Image and matte, uint8; 0 outside the photograph.
+        Image and matte, uint8; 0 outside the original image.
     """
     layers = np.concatenate((image, matte[..., None]), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()

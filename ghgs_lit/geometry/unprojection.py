@@ -11,32 +11,31 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, unproject_maps
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
-#: Border in pixels that the token grid of the release leaves out (512 + 2 x 3 = 518).
+#: Padding in pixels that the token grid of the release ignores (512 + 2 x 3 = 518).
 RELEASE_BORDER = 3
 
 
 class Unprojection(Options):
-    """``unprojection(depth_maps, tokens, batch) -> Points``, without parameters,
-    in float32 or wider.
+    """Stage ``unprojection(depth_maps, tokens, batch) -> Points``, without parameters, in float32 or
+    wider.
 
-    With ``tokens="subject"`` the mean pixel and the mean depth keep a token's point on the surface:
-    at a silhouette the patch's centre may lie beside the subject. A patch without a valid pixel
-    lies at its centre and mean depth, and is not valid. With ``"release"`` inverse depths are
-    sampled bilinearly (2 x 2) and pixels are the centres of a grid over the image without its
-    border; the same tokens are valid."""
+    With ``tokens="subject"``, mean pixel and mean depth of the subject keep a token's point on the
+    surface: at a silhouette, the centre of a patch may lie off the subject. A patch without a valid
+    pixel uses its centre and mean depth, and is invalid. With ``"release"``, inverse depths are
+    sampled bilinearly (2 x 2), and pixels are the centres of a grid over the image without its
+    padding; the same tokens are valid."""
 
     group = "unprojection"
     tokens: Literal["subject", "release"] = "subject"
-    """Where a token lies: subject, at the mean pixel and mean depth of the subject's pixels in
-    its patch | release, as in the authors' code, which scales intrinsics by 37 / 512 as if there
-    were no border"""
+    """Position of a token: subject: mean pixel and mean depth of the subject's pixels in its patch;
+    release: as in the authors' code, which scales intrinsics by 37 / 512 and ignores the padding."""
 
     def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> Points:
         locate = subject_tokens if self.tokens == "subject" else _release_tokens
         pixels, depth, valid = locate(depth_maps, tokens.patch_size)
         cameras = batch.cameras
         points = unproject_maps(depth, cameras, pixels)
-        # The maps hold every patch, also those without a token.
+        # The maps cover every patch, also those without a token.
         index = (tokens.image, tokens.row, tokens.column)
         tokens_valid = valid.flatten(0, 1)[index]
         return Points(
@@ -61,7 +60,7 @@ def _release_tokens(depth_maps: DepthMaps, patch_size: int) -> tuple[Tensor, Ten
 def subject_tokens(
     depth_maps: DepthMaps, patch_size: int
 ) -> tuple[Float[Tensor, "B V h w 2"], Float[Tensor, "B V h w"], Bool[Tensor, "B V h w"]]:
-    """Where the tokens of patches lie, and how far: means over the valid pixels of each patch.
+    """Mean pixel and mean depth of the valid pixels of each patch; of all its pixels if none is valid.
 
     Args:
         depth_maps: with sides that are multiples of the patch size.
@@ -69,7 +68,7 @@ def subject_tokens(
 
     Returns:
         Mean pixels ``(u, v)`` [B, V, h, w, 2], mean depths [B, V, h, w], and whether a patch has
-        valid pixels [B, V, h, w]; without any, means are those of all its pixels.
+        valid pixels [B, V, h, w].
     """
     depth = at_least_float32(depth_maps.depth)
     valid = depth_maps.valid
@@ -91,13 +90,14 @@ def subject_tokens(
 
 
 def seen_surfaces(batch: Batch) -> list[Float[Tensor, "_ 3"]]:
-    """Points of the true surface: one for each of the subject's input pixels whose depth is known.
+    """Points of the true surface seen in the input views, one per pixel of the subject with a known
+    depth.
 
     Args:
         batch: with ``depths``.
 
     Returns:
-        For each element, points [_, 3] in the world, in metres.
+        Points [_, 3] of each element, in the world, in metres.
     """
     points = unproject_maps(batch.depths, batch.cameras)
     known = batch.masks & (batch.depths > 0)
