@@ -1,1 +1,1 @@
-"""Measuring methods on evaluation protocols."""
+"""Evaluation of models and baselines on target protocols."""

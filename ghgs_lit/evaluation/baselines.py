@@ -1,5 +1,4 @@
-"""Baselines: methods that a user might pick instead of a model,
-and simple ones that it must beat."""
+"""Baselines: alternatives to a trained model, and simple methods that a model must beat."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,8 +20,7 @@ from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.refinement import Change, Refinement
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction
 
-#: Finer and closer to the masks than a model's bounds,
-#: which must contain the subject despite bad masks.
+#: Finer and tighter than a model's bounds, which must contain the subject despite bad masks.
 HULL = VisualHull(dilation=0.005, samples=192)
 
 
@@ -39,8 +37,9 @@ def hull_bounds(batch: Batch) -> DepthBounds:
 
 
 def hull_depth(batch: Batch) -> Tensor:
-    """Depth of the visual hull's surface. Its splats resemble the image-based visual hull
-    (Matusik et al. 2000).
+    """Depth of the front surface of the visual hull.
+
+    Splats at these depths resemble the image-based visual hull (Matusik et al. 2000).
 
     Args:
         batch: Masks and cameras are read.
@@ -51,8 +50,8 @@ def hull_depth(batch: Batch) -> Tensor:
     return batch.once(hull_bounds).near * batch.masks
 
 
-#: Number of compared depths; half the side of the window over which consistency is averaged, over
-#: the longer side of the image; temperature of the softmax over depths. Tuned on four people,
+#: Number of swept depths; half the side of the window over which consistency is averaged, as a
+#: share of the image's longer side; temperature of the softmax over depths. Tuned on four people
 #: with 3 to 5 views.
 DEPTHS = 32
 WINDOW = 0.02
@@ -60,14 +59,14 @@ SOFTNESS = 0.03
 
 
 def photo_depth(batch: Batch) -> Tensor:
-    """Depths of a plane sweep between the hull's surfaces.
+    """Depths of a plane sweep between the front and back surfaces of the visual hull.
 
-    They are means of the sweep's depths, weighted by their photo-consistency in a window
-    (soft argmin of Kendall et al., ICCV 2017): the middle of the hull where all depths are
-    equally consistent.
+    Each is the mean of the swept depths, weighted by the softmax of their photo-consistency in a
+    window (soft argmin of Kendall et al., ICCV 2017). It is the middle of the hull where all depths
+    are equally consistent.
 
     Args:
-        batch: Photographs, masks and cameras are read.
+        batch: Images, masks and cameras are read.
 
     Returns:
         Depths [B, V, H, W], metres; 0 outside the subject.
@@ -82,8 +81,7 @@ def photo_depth(batch: Batch) -> Tensor:
 
 
 def _shared(values: Tensor, masks: Tensor, radius: int) -> Tensor:
-    """Means of ``values`` [B, V, S, H, W] over the subject's pixels in a window around
-    each pixel."""
+    """Average ``values`` [B, V, S, H, W] over the subject's pixels in a window around each pixel."""
     inside = masks.to(values.dtype)
     counts = _window_mean(inside, radius)
     sums = _window_mean((values * inside[:, :, None]).flatten(1, 2), radius).view_as(values)
@@ -91,14 +89,14 @@ def _shared(values: Tensor, masks: Tensor, radius: int) -> Tensor:
 
 
 def _window_mean(maps: Tensor, radius: int) -> Tensor:
-    """Means over a square window [B, n, H, W], zero beyond the border."""
+    """Means [B, n, H, W] over a square window; maps are 0 outside the image."""
     side = 2 * radius + 1
     maps = F.avg_pool2d(maps, (side, 1), 1, (radius, 0))
     return F.avg_pool2d(maps, (1, side), 1, (0, radius))
 
 
-#: Discs, as ``model=recurrent`` starts: standard deviations along and across the surface and
-#: distance behind it in pixel footprints; opacity; low-pass filter in px^2.
+#: Discs like the initial ones of ``model=recurrent``: standard deviations along and across the
+#: surface and distance behind it, in pixel footprints; opacity; low-pass filter in px^2.
 _ALONG = 0.5
 _ACROSS = 0.1
 _INWARD = 0.4
@@ -111,14 +109,14 @@ _MATTE = 0.125
 def splats_at(
     batch: Batch, depth: Tensor, valid: Tensor, sigma: float = 0.3, opacity: float = 0.9
 ) -> Gaussians:
-    """Round splats at the points of pixels.
+    """Isotropic Gaussians at the unprojected pixels.
 
     Args:
-        batch: Gives colours and cameras.
+        batch: Colours and cameras are read.
         depth: Depths [B, V, H, W], metres.
-        valid: Pixels [B, V, H, W] that get a splat.
-        sigma: Standard deviation in pixels of the inputs.
-        opacity: Of all splats, in (0, 1).
+        valid: Pixels [B, V, H, W] that get a Gaussian.
+        sigma: Standard deviation in pixels of the input views.
+        opacity: Opacity of all Gaussians, in (0, 1).
 
     Returns:
         Gaussians in the order of the valid pixels.
@@ -140,11 +138,10 @@ def splats_at(
 
 
 def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
-    """Discs on the surface of depth maps, like the initial Gaussians of heads with
-    ``axes=surface``.
+    """Discs on the surface of depth maps, like the initial Gaussians of heads with ``axes=surface``.
 
     Args:
-        batch: Gives colours, mattes and cameras.
+        batch: Colours, mattes and cameras are read.
         depth: Depths [B, V, H, W], metres.
         valid: Pixels [B, V, H, W] that get a disc.
 
@@ -177,7 +174,7 @@ def body_depth(batch: Batch) -> Tensor:
         batch: Body vertices and cameras are read.
 
     Returns:
-        Depths [B, V, H, W], metres, the same for all pixels of a view.
+        Depths [B, V, H, W], metres, constant in each view.
 
     Raises:
         InputError: The data has no bodies.
@@ -192,16 +189,13 @@ def body_depth(batch: Batch) -> Tensor:
 
 
 def true_depth(batch: Batch) -> Tensor:
-    """Depth maps of the data.
-
-    Args:
-        batch: With depths, where the data has them.
+    """Ground-truth depth maps of the data.
 
     Returns:
         Depths [B, V, H, W], metres.
 
     Raises:
-        InputError: There are none.
+        InputError: The data has no depth maps.
     """
     if batch.depths is None:
         raise InputError("baselines: true_depth expects depth maps in the data; found none")
@@ -209,12 +203,12 @@ def true_depth(batch: Batch) -> Tensor:
 
 
 def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
-    """Estimate by discs at given depths; with mattes also at the rim.
+    """Render discs at given depths; where the batch has mattes, also at pixels of the rim.
 
     Args:
         batch: With targets.
-        depth_of: Gives depths [B, V, H, W] of a batch, metres; 0: no disc.
-        renderer: Draws the discs from the target cameras.
+        depth_of: Computes depths [B, V, H, W] of a batch, metres; 0: no disc.
+        renderer: Renders the discs from the target cameras.
 
     Returns:
         Renders, depths and discs.
@@ -236,22 +230,21 @@ CHANGES = {
     "opacities": Change(limit=7.0, rate=0.1),
     "colors": Change(limit=0.05, rate=0.001),
 }
-#: Standard deviation in pixels and opacity of the initial Gaussians.
+#: Initial Gaussians of ``per_scene``: standard deviation in pixels; opacity.
 SIGMA = 0.5
 OPACITY = 0.5
 
 
 @dataclass(frozen=True)
 class PerScene:
-    """3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel,
-    as a method.
+    """Per-scene 3D Gaussian splatting (Kerbl et al. 2023), fitted to the input views.
 
-    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each
-    photograph is more than the photographs determine.
+    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of the subject
+    in each input view is more than the views determine.
 
     Args:
-        renderer: Draws inputs and targets.
-        steps: Of the optimiser, at least 1.
+        renderer: Renders input and target views.
+        steps: Steps of the optimiser, at least 1.
     """
 
     renderer: Renderer
@@ -266,10 +259,10 @@ class PerScene:
         """Initial Gaussians.
 
         Args:
-            batch: Photographs, masks and cameras are read.
+            batch: Images, masks and cameras are read.
 
         Returns:
-            A round splat for each pixel of the subject.
+            An isotropic Gaussian for each pixel of the subject.
         """
         depth = photo_depth(batch)
         return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
@@ -281,10 +274,10 @@ class PerScene:
 
 
 def black(batch: Batch) -> Estimate:
-    """A black image, which scores the background alone.
+    """Predict black images, which score the background alone.
 
     Args:
-        batch: With targets of T photographs of h x w pixels.
+        batch: With T targets of h x w pixels.
 
     Returns:
         Zeros [B, T, 3, h, w].
@@ -293,13 +286,13 @@ def black(batch: Batch) -> Estimate:
 
 
 def nearest_view(batch: Batch) -> Estimate:
-    """The input photograph whose viewing direction is nearest to that of the target.
+    """Predict each target as the input view with the nearest viewing direction.
 
     Args:
-        batch: With photographs [B, V, 3, H, W] and targets of h x w pixels.
+        batch: With images [B, V, 3, H, W] and T targets of h x w pixels.
 
     Returns:
-        For each target that photograph, at the target's size.
+        Input views [B, T, 3, h, w], resized to the size of the targets.
     """
     forward = batch.cameras.extrinsics[..., 2, :3]
     wanted = batch.targets.cameras.extrinsics[..., 2, :3]
@@ -313,7 +306,7 @@ def nearest_view(batch: Batch) -> Estimate:
     return Estimate(images)
 
 
-#: Depth of the discs of a baseline, by name.
+#: Baselines that render discs, with the function of their depths.
 DEPTH_OF = {
     "body_depth": body_depth,
     "hull": hull_depth,
@@ -329,16 +322,13 @@ def baseline(
     untrained: Callable[[], Callable[[Batch], Prediction]],
     per_scene: nodes.PerScene,
 ) -> Method:
-    """The baseline of a name.
+    """Build a baseline.
 
     Args:
         name: One of ``BASELINES``.
-        renderer: Draws Gaussians from the target cameras.
-        untrained: Builds what predicts with random weights, for ``untrained``.
-        per_scene: Options of the baseline of that name.
-
-    Returns:
-        The method, which predicts a batch without training.
+        renderer: Renders Gaussians from the target cameras.
+        untrained: Builds a predictor with random weights, for ``untrained``.
+        per_scene: Options of ``per_scene``.
 
     Raises:
         InputError: There is no such baseline.

@@ -31,9 +31,9 @@ class Estimate:
 
     Attributes:
         image: renders of the targets, [B, T, 3, h, w].
-        depth: of the inputs, metres, [B, V, H, W].
+        depth: z-depths of the input views, metres, [B, V, H, W].
         depth_valid: where ``depth`` is defined, [B, V, H, W] bool.
-        gaussians: what was drawn.
+        gaussians: the rendered Gaussians.
         not_finite: number of Gaussians and subject depths of each element that are not finite.
         recalibrated: the recalibration with its inputs, where it has neighbours.
     """
@@ -51,15 +51,15 @@ Method = Callable[[Batch], Estimate]
 
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model with its renderer and optional refinement of Gaussians and cameras.
+    """A model with its renderer, and optional refinement of Gaussians and cameras.
 
-    Refined Gaussians leave the predicted depths, so there is no depth estimate then.
+    Refined Gaussians are not at the predicted depths, so the estimate then has no depth.
 
     Args:
-        predict: gives the prediction of a batch.
-        renderer: draws Gaussians from the target cameras.
-        refinement: of the predicted Gaussians; None: none.
-        cameras: refinement of the input cameras before the prediction; None: none.
+        predict: predicts a batch.
+        renderer: renders Gaussians from the target cameras.
+        refinement: refines the predicted Gaussians; None: no refinement.
+        cameras: refines the input cameras before the prediction; None: no refinement.
     """
 
     predict: Callable[[Batch], Prediction]
@@ -81,17 +81,17 @@ class ModelMethod:
         image = self.renderer(gaussians, batch.targets.cameras).image
         valid = prediction.depth_valid
         lost = not_finite(batch, prediction)
-        # Smaller copies of photographs (coarse to fine) go through the stages first.
+        # The last call: downsampled images (coarse to fine) pass through the stages first.
         last = seen[-1] if seen else None
         return Estimate(image, depth, valid, gaussians, lost, last)
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
-    """Count what is not finite; a warning names the subjects that have any.
+    """Count Gaussians and depths that are not finite, and warn with the names of their subjects.
 
     Args:
-        batch: Of B subjects; depths count inside its masks.
-        prediction: Of that batch.
+        batch: B subjects; depths inside the masks are counted.
+        prediction: the prediction for this batch.
 
     Returns:
         Number of non-finite Gaussians and depths of each subject.
@@ -114,8 +114,8 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
 
 
 def _surface_errors(batch: Batch, gaussians: Gaussians) -> list[float | None]:
-    """Error of each element's Gaussians against the true surface that the inputs show;
-    None: unknown."""
+    """Error of each element's Gaussians against the true surface that the input views show; None:
+    unknown."""
     if batch.depths is None:
         return [None] * len(batch.images)
     splats = [gaussians[element] for element in range(len(batch.images))]
@@ -154,15 +154,7 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
 
 
 def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
-    """Save a picture of one subject for each protocol: inputs, depths, targets, renders and errors.
-
-    Args:
-        batch: With targets of one or more protocols.
-        estimate: Of that batch.
-        element: Number of the subject in the batch.
-        pictures: Folder of the PNG files.
-        name: Of the method, for the files' names.
-    """
+    """Save a picture of one subject for each protocol: inputs, depths, targets, renders and errors."""
     for protocol in dict.fromkeys(batch.targets.protocols):
         chosen = [p == protocol for p in batch.targets.protocols]
         part = dataclasses.replace(batch, targets=batch.targets.of_protocol(protocol))
@@ -186,16 +178,16 @@ def measure(
 
     Args:
         method: Predicts a batch.
-        name: Of the method, for the rows.
+        name: Name of the method in the rows.
         loader: Batches with targets.
-        metrics: What is measured on images.
-        device: Where batches are predicted and measured.
-        pictures: Folder for pictures; None: none are drawn.
-        picture_count: Number of subjects that are drawn, the first ones.
+        metrics: Metrics of images.
+        device: Device of prediction and metrics.
+        pictures: Folder for pictures; None: no pictures.
+        picture_count: Number of subjects with pictures, from the first.
 
     Returns:
-        Rows with what they are about, metrics, and ``seconds``: those of prediction and all renders
-        of a batch, divided by its subjects.
+        Rows with method, subject, views and target, the metrics, and ``seconds``: time of the
+        prediction and all renders of a batch, divided by the number of its subjects.
 
     Raises:
         InputError: A batch has no targets.
@@ -229,21 +221,21 @@ def measure_all(
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Measure all methods on the same photographs.
+    """Measure all methods on the same input views and targets.
 
     Args:
         methods: Methods by name.
-        data: Gives the batches of an evaluation.
-        views: Numbers of input views, each measured by itself.
+        data: Provides ``evaluation_loader``.
+        views: Numbers of input views, each measured separately.
         targets: Target protocols by name.
         split: Split of the data that is measured.
-        metrics: What is measured on images.
-        device: Where batches are predicted and measured.
-        pictures: Folder for pictures; None: none are drawn.
-        picture_count: Number of subjects that are drawn for each method and number of views.
+        metrics: Metrics of images.
+        device: Device of prediction and metrics.
+        pictures: Folder for pictures; None: no pictures.
+        picture_count: Number of subjects with pictures, for each method and number of views.
 
     Returns:
-        Rows as of :func:`measure`, by number of views, then protocol, then method.
+        Rows as in :func:`measure`, by number of views, then protocol, then method.
 
     Raises:
         InputError: A batch has no targets.

@@ -10,14 +10,14 @@ from ghgs_lit.errors import choice, require
 
 
 def target_protocols(run: Run) -> dict[str, dict[str, Any]]:
-    """Protocols that ``evaluation.targets`` lists.
+    """Read the protocols that ``evaluation.targets`` lists.
 
     Args:
         run: With the groups ``evaluation`` and ``targets``.
 
     Returns:
-        Values of each protocol by name: those of its file in ``conf/targets`` or, for the one that
-        ``targets=`` selects, the configured ones.
+        Values of each protocol by name: those of its file in ``conf/targets``, or the configured ones
+            for the protocol that ``targets=`` selects.
 
     Raises:
         InputError: There is no such file.
@@ -31,15 +31,15 @@ def target_protocols(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def check_evaluation(run: Run, data: PhotographsDataModule) -> None:
-    """Check that an evaluation can be measured; data is prepared, no photograph is read.
+    """Check that an evaluation can be measured. Data is prepared, but no image is read.
 
     Args:
         run: With the groups ``evaluation``, ``metrics`` and ``targets``.
         data: The data that is measured.
 
     Raises:
-        InputError: A value is impossible, a metric cannot be computed, the split has no subjects,
-            or a subject lacks an input or a target.
+        InputError: A value is impossible, a metric cannot be computed, the split has no subjects, or
+            a subject lacks an input view or a target.
     """
     views = run.evaluation.views
     for key, values in (("views", views), ("targets", run.evaluation.targets)):
@@ -60,17 +60,8 @@ def check_evaluation(run: Run, data: PhotographsDataModule) -> None:
 
 
 def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol: TargetProtocol) -> None:
-    """Check that each subject has the target photographs of a protocol.
-
-    Args:
-        data: The data that is measured.
-        split: Split of it.
-        views: Number of input views.
-        protocol: Which photographs are targets.
-
-    Raises:
-        InputError: Names the first view that is not there.
-    """
+    """Check that each subject has the target views of a protocol; the error names the first missing
+    view."""
     reader = data.photographs(split).reader
     for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.groups:
         for sample in batch:

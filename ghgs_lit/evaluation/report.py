@@ -15,12 +15,12 @@ from ghgs_lit.evaluation.measure import Method, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.results import METHOD, Row, provenance, summarize, write_results
 
-#: Print a line once per process: all runs of a sweep lack the same.
+#: Print a line once per process: runs of a sweep leave out the same metrics.
 print_once = cache(print)
 #: Printed metrics and their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "psnr_edge": 2, "ssim": 4, "lpips": 4, "flip": 4}
 PRINTED |= {"spill": 1, "sharpness": 2, "depth_error_mm": 1, "seconds": 2}
-#: Units in the heads of printed metrics whose names lack them.
+#: Units in the column heads of printed metrics whose names have none.
 _UNITS = dict.fromkeys(("psnr", "psnr_box", "psnr_edge"), "\ndB") | {"spill": "\n‰"}
 #: Descriptions of splits for readers of the results.
 SPLITS = {
@@ -38,15 +38,17 @@ def measure_and_write(
     /,
     **facts: Any,
 ) -> Path:
-    """Measure methods as configured, print the means and write ``metrics.json``, ``metrics.csv``
-    and ``pictures/``. Call :func:`check_evaluation` before.
+    """Measure methods as configured, print the means, and write the results.
+
+    Writes ``metrics.json``, ``metrics.csv`` and ``pictures/``. Call
+    :func:`ghgs_lit.evaluation.protocols.check_evaluation` first.
 
     Args:
         methods: Methods by name; the trained model is called ``METHOD``.
-        data: Gives the batches of an evaluation.
-        run: As configured.
+        data: Provides ``evaluation_loader``, ``facts`` and ``dataset``.
+        run: The configuration.
         directory: The run's directory.
-        device: Where batches are predicted and measured.
+        device: Device of prediction and metrics.
         **facts: Further provenance.
 
     Returns:
@@ -87,11 +89,11 @@ def measure_and_write(
 
 
 def table_of(summary: Sequence[Row], form: str = "simple") -> str:
-    """Means over subjects as a table for readers.
+    """Format means over subjects as a table.
 
     Args:
         summary: Rows of :func:`ghgs_lit.runs.results.summarize`.
-        form: Of tabulate; ``github``: Markdown.
+        form: Format of tabulate, such as ``simple`` (for a terminal) or ``github`` (Markdown).
     """
     names = [name for name in PRINTED if name in summary[0]]
     about = ["method", "views", "targets"]

@@ -1,4 +1,4 @@
-"""Assembly of tables from measurements: which runs they show, and their rows and columns."""
+"""Assembly of tables from measurements: selection of runs, rows and columns."""
 
 import itertools
 import re
@@ -25,28 +25,28 @@ BASELINES = {
     "true_depth": "Discs at the true depth",
     "untrained": "Untrained model",
 }
-#: Titles of models that follow other methods.
+#: Titles of models that are modelled on other methods.
 PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
 #: Kinds of measured rows from top to bottom.
 _KINDS = ("baseline", "other", "model")
-#: Columns of measurements that are no metrics.
+#: Columns of measurements that are not metrics.
 _FACTS = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject"}
 _FACTS |= {"count", "origin", "trained"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """Tables of the measurements of a sweep: one for each setting, and for each model if rows are ablations.
+    """Build the tables of a sweep: one for each setting and, if rows are ablations, each model.
 
     Args:
-        sweep: Runs of ours.
+        sweep: Our runs.
         others: Results of other methods, one frame for each file.
-        options: What the tables show.
+        options: Content of the tables.
 
     Returns:
         Tables in the order in which their settings first appear.
 
     Raises:
-        InputError: Nothing was measured on these targets, two runs claim one cell, configurations
+        InputError: Nothing was measured on these targets, two runs have the same cell, configurations
             in a cell differ, or results of other methods fit no table.
     """
     layout = options.layout
@@ -91,9 +91,11 @@ def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.Data
 
 
 def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
-    """The runs that a layout shows, of those of all layouts in a folder: with its numbers of views; on
-    the paper's data, if any are; no baselines among ablations, and none of the paper's ablations
-    among methods."""
+    """Select the runs of a layout.
+
+    They have its numbers of views and, if any run has, the paper's data. Tables of ablations exclude
+    baselines; tables of methods exclude the paper's ablations.
+    """
     layout = options.layout
     views = options.views or layout.views
     rows = sweep.rows[sweep.rows["views"].isin(views)]
@@ -182,7 +184,7 @@ def _reported_lines(layout: Layout) -> list[Line]:
 
 
 def _ablation_lines(variants: list[Variant]) -> list[Line]:
-    """Rows of all four ablations, then of a user's own."""
+    """Rows of the paper's four ablations, then of user-defined ones."""
     papers = [replace(variants[0], ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
     lines = []
     for variant in (*papers, *(variant for variant in variants if variant.is_own)):
@@ -193,7 +195,7 @@ def _ablation_lines(variants: list[Variant]) -> list[Line]:
 
 
 def _method_lines(variants: list[Variant]) -> list[Line]:
-    """Rows of baselines, other methods and ours, which are named by what distinguishes them."""
+    """Rows of baselines, other methods and our models, which are named by their differences."""
     models = [variant for variant in variants if variant.kind == "model"]
     parts = [[v.model, v.encoder, v.ablation, *v.titles] for v in models]
     differs = [len(set(values)) > 1 for values in zip(*parts, strict=True)]

@@ -19,10 +19,11 @@ def fill(table: Table) -> None:
     """Fill the cells of a table.
 
     Args:
-        table: With rows, lines, groups and metrics; gets ``cells`` and ``comparisons``.
+        table: With rows, lines, groups and metrics; ``cells`` and ``comparisons`` are set.
 
     Raises:
-        InputError: Runs with other numbers claim one cell and seed, or configurations in a cell differ.
+        InputError: Runs with different numbers have the same cell and seed, or configurations in a
+            cell differ.
     """
     values = _values(table)
     _refuse_rivals(table, values)
@@ -38,7 +39,7 @@ def fill(table: Table) -> None:
     cells["mean"] = cells["mean"].fillna(_reported(table))
     cells["lacking"] = _lacking(table, cells["seeds"])
     table.cells = cells.assign(best=False, marked=False, test=None)
-    # Without baselines, some of which are given the truth.
+    # Without baselines: some of them read the ground truth.
     competing = [i for i, line in enumerate(table.lines) if line.variant.kind in ("model", "other")]
     competing = cells["mean"].dropna().loc[lambda means: means.index.isin(competing, level="line")]
     for column, means in competing.groupby(CELL[1:]):
@@ -50,7 +51,8 @@ def fill(table: Table) -> None:
 
 
 def _values(table: Table) -> pd.DataFrame:
-    """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
+    """Long form, one row per value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``,
+    ``value``."""
     rows = table.rows
     lines = {line.variant: i for i, line in enumerate(table.lines) if line.variant.kind != "reported"}
     groups = {(group.views, group.data): i for i, group in enumerate(table.groups)}
@@ -66,7 +68,7 @@ def _values(table: Table) -> pd.DataFrame:
 
 
 def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
-    """Refuse several runs for one cell and seed, and runs of different configurations in one cell."""
+    """Reject different numbers for one cell and seed, and different configurations in one cell."""
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
         if part["value"].nunique() > 1:
@@ -74,18 +76,18 @@ def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
     for cell, column in values.groupby(["line", "group"], sort=False)["source"]:
         sources = list(dict.fromkeys(column))
         for key, texts in _differing(table, sources).items():
-            # Another version of the package has other keys; copies of the data lie in other folders.
+            # Keys depend on the package's version, folders on the machine.
             if len({*texts} - {ABSENT}) > 1 and not is_below(key, OF_A_PLACE):
                 raise _rivals(table, cell, sources, "one configuration for %s")
 
 
 def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
-    """Keys in which the models of runs differ beyond what the runs of a row may."""
+    """Keys beyond ``OF_A_RUN`` in which configurations of the runs' models differ."""
     return differing([table.configs[source] for source in sources if source in table.configs], OF_A_RUN)
 
 
 def _rivals(table: Table, cell: tuple[int, int], sources: Sequence[str], expected: str) -> InputError:
-    """The error that runs claim one cell, with the keys of ``by`` that give each a row."""
+    """The error for several runs in one cell, with the keys of ``by`` that give each its own row."""
     variant = table.lines[cell[0]].variant
     row = f"ablation={variant.ablation}" if variant.ablation else variant.name
     keys = _differing(table, sources)
@@ -106,7 +108,7 @@ def _reported(table: Table) -> pd.Series:
         row = paper()["tables"][table.layout.reported]["rows"][line.variant.name]
         by_group = {data_title(key) if isinstance(key, str) else key: values for key, values in row.items()}
         for i, group in enumerate(table.groups):
-            # The paper does not report with how many views its Table 1 was measured.
+            # The paper does not report the number of views of its Table 1.
             values = by_group.get(group.data or group.views, [])
             figures |= {(number, i, name): x for name, x in zip(paper()["metrics"], values, strict=False)}
     return pd.Series(figures, dtype=float)
@@ -126,8 +128,11 @@ def _lacking(table: Table, measured: pd.Series) -> list[tuple[int, ...]]:
 
 
 def _mark_best(table: Table, means: pd.Series, arrow: str) -> None:
-    """Mark the best means of a column, as printed. None is marked if all are equal, no direction is
-    better, or the best leads by no more than the larger deviation over seeds of the best two."""
+    """Mark the best means of a column, as printed.
+
+    None is marked if all are equal, if the metric has no better direction, or if the best leads by no
+    more than the larger deviation over seeds of the best two.
+    """
     if means.nunique() < 2 or not arrow:
         return
     means = means.sort_values(ascending=arrow == "↓")
@@ -149,7 +154,10 @@ def _by_person(table: Table, values: pd.DataFrame) -> pd.DataFrame:
 
 def _test(table: Table, people: pd.DataFrame, competing: pd.Series) -> None:
     """Test each row against the reference of its column, corrected over all comparisons of the table.
-    If the reference was chosen by its figures, every pair of rows of the column counts as a comparison."""
+
+    If the reference was chosen by its figures, every pair of rows of the column counts as a
+    comparison.
+    """
     alpha = table.options.test.alpha
     competing = competing[competing.index.isin(people.index.droplevel("seed"))]
     tests: dict[tuple, Comparison] = {}
@@ -178,9 +186,12 @@ def _test(table: Table, people: pd.DataFrame, competing: pd.Series) -> None:
 
 
 def _reference(table: Table, means: pd.Series) -> tuple[tuple | None, bool]:
-    """The cell with which the others of a column are compared (None: there is none): that of the whole
-    method where it has one row and ``test.against`` is ``full``, else the best; and whether it was chosen
-    by its figures."""
+    """The cell that the others of a column are compared with, and whether it was chosen by its
+    figures.
+
+    With ``test.against=full`` it is the row of the whole method, if there is exactly one; else the
+    best. None: the column has no reference.
+    """
     full = [cell for cell in means.index if table.lines[cell[0]].variant.ablation == "full"]
     if table.options.test.against == "full" and len(full) == 1:
         return full[0], False

@@ -1,4 +1,4 @@
-"""Layouts of tables (the paper's four, the ablation at several numbers of views) and their parts."""
+"""Layouts of tables (the paper's four, and the ablation at several numbers of views) and their parts."""
 
 import re
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from ghgs_lit.parsing import read_yaml
 
 
 class Metric(NamedTuple):
-    """How a metric is printed; the arrow is ↑ where higher is better, ↓ where lower, else empty."""
+    """Printed form of a metric; the arrow is ↑ where higher is better, ↓ where lower is, else empty."""
 
     title: str
     decimals: int
@@ -43,7 +43,8 @@ METRICS = {
 
 
 def metric_of(name: str) -> Metric:
-    """How a metric such as ``psnr_box`` is printed: its entry, else that of the metric without its region."""
+    """Printed form of a metric such as ``psnr_box``: its entry, else that of the metric without its
+    region."""
     stem, _, region = name.partition("_")
     known = METRICS.get(stem, Metric("", 4, ""))
     return METRICS.get(name) or known._replace(title=f"{stem.upper()} {region}".strip())
@@ -53,12 +54,12 @@ class Layout(NamedTuple):
     """Rows and groups of columns of a table.
 
     Attributes:
-        name: Of the layout, for ``ghgs table``.
+        name: Name of the layout in ``ghgs table``.
         rows: ``ablation`` (all four combinations) or ``methods``.
         columns: One group for each of ``views`` or ``data``.
-        views: Numbers of input views that are shown.
-        heading: Of each group: ``views``, ``data`` or ``none``.
-        reported: The paper's table whose figures are shown next to the measured ones; None: none.
+        views: Numbers of input views in the table.
+        heading: Heading of each group: ``views``, ``data`` or ``none``.
+        reported: The paper's table whose figures are printed next to the measured ones; None: none.
     """
 
     name: str
@@ -80,17 +81,17 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What a table shows.
+    """Content of a table.
 
     Attributes:
         layout: Rows and columns.
-        views: A selection of numbers of views; None: those of the layout.
-        targets: A selection of target protocols; None: those of the runs.
-        metrics: A selection of metrics; None: those of the runs.
-        reported: Whether the paper's figures are shown where the layout has some.
-        test: How rows are compared.
+        views: Numbers of input views; None: those of the layout.
+        targets: Target protocols; None: those of the runs.
+        metrics: Metrics; None: PSNR, SSIM and LPIPS, or FLIP where a run of a model has no LPIPS.
+        reported: Whether the paper's figures are printed where the layout has some.
+        test: Comparison of rows.
         unit: Regular expression whose first group is the person, if subjects are frames of people.
-        subjects: Regular expression of the names of a selection of subjects; None: all.
+        subjects: Regular expression that matches the whole names of the selected subjects; None: all.
     """
 
     layout: Layout
@@ -104,7 +105,8 @@ class TableOptions:
 
 
 class Group(NamedTuple):
-    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views`` input views."""
+    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views`` input
+    views."""
 
     title: str
     views: int
@@ -119,28 +121,29 @@ class Line(NamedTuple):
 
 
 CELL = ["line", "group", "metric"]
-"""What identifies a cell: numbers of the line and of the group of columns, and the metric."""
+"""Index of a cell: numbers of the line and of the group of columns, and the metric."""
 
 
 @dataclass
 class Table:
-    """A table, with everything that a writer of a format needs.
+    """A table, with everything that writers of all formats need.
 
     Attributes:
-        options: What it shows.
-        rows: Measurements, as in :class:`Sweep`.
+        options: Content of the table.
+        rows: Measurements, as in :class:`ghgs_lit.evaluation.tables.runs.Sweep`.
         planned: Training runs of the table that have no results yet.
         configs: Configuration of our model by ``source``.
         stub: Headings of the columns that name a row.
         groups: Groups of columns.
         metrics: Names of the metrics of each group.
         lines: Rows of the table.
-        left_out: Number of runs that the table does not show.
+        left_out: Number of runs that are not in the table.
         reported_on: Data of the reported figures, if any.
         cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over
             seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples,
             ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed),
-            ``test`` (a :class:`Comparison` or None), ``marked`` (significant).
+            ``test`` (a :class:`ghgs_lit.evaluation.tables.significance.Comparison` or None),
+            ``marked`` (significant).
         tested: Names of the metrics that are tested.
         comparisons: Number of comparisons that are corrected together.
         caption: Above the table.
@@ -179,7 +182,7 @@ class Table:
 
 @cache
 def paper() -> dict[str, Any]:
-    """What the paper's tables print, as in ``reported.yaml``."""
+    """The paper's printed figures, as in ``reported.yaml``."""
     return read_yaml(Path(__file__).with_name("reported.yaml"))
 
 

@@ -30,7 +30,7 @@ _NEIGHBORS = (
     " without it (`columns=[shared_neighbors]`), because recalibration.k is close to the number of tokens:"
     " give a share, such as 0.1."
 )
-#: Share of equal neighbours above which the ablation of 3D unprojection compares nearly the same methods.
+#: Share of equal neighbours above which the ablation of 3D unprojection hardly changes the method.
 _MOSTLY_SHARED = 0.8
 _STEPS = "Rows were trained for different numbers of steps: `columns=[psnr,steps]` shows them."
 _SEEDS = "Rows are of different seeds, which `table.csv` lists."
@@ -38,7 +38,8 @@ _PARTIAL = "(2/3): from 2 of 3 seeds; the others have no results yet."
 
 
 def write_caption(table: Table) -> str:
-    """Caption of a table in one line of Markdown: data, subjects, protocol, model and number of seeds."""
+    """Caption of a table in one line of Markdown: data, subjects, protocol, model and number of
+    seeds."""
     first = table.rows.iloc[0]
     variant = first["variant"]
     names = " and ".join(f"`{name}`" for name in dict.fromkeys(table.rows["data"]))
@@ -69,7 +70,7 @@ def _range(values: Iterable[Any]) -> str:
 
 
 def write_notes(table: Table) -> list[str]:
-    """Notes below a table that change how it is read, as paragraphs of Markdown."""
+    """Notes below a table that affect its interpretation, as paragraphs of Markdown."""
     kinds = table.rows["variant"].map(lambda variant: variant.kind)
     ours = table.rows[kinds == "model"]
     others = table.rows[kinds == "other"]
@@ -123,7 +124,8 @@ def _first_of(names: list[str]) -> str:
 
 
 def _differing(table: Table, ours: pd.DataFrame, shown: set[str]) -> dict[str, list[str]]:
-    """Keys in which runs of a row, or of all rows of ablations, differ beyond those that are shown."""
+    """Keys in which runs of a row, or of all rows of ablations, differ, except for those in
+    ``shown``."""
     groups: dict[tuple, list] = {}
     for source, rows in ours.groupby("source", sort=False):
         variant = rows["variant"].iloc[0]
@@ -137,7 +139,7 @@ def _differing(table: Table, ours: pd.DataFrame, shown: set[str]) -> dict[str, l
 
 
 def _about_test(table: Table, ablations: list[str]) -> list[str]:
-    """What the marks mean, and the smallest difference that the seeds and subjects could show."""
+    """Meaning of the marks, and the smallest difference that the seeds and subjects could show."""
     tests = table.cells["test"].dropna()
     known = [test for test in tests if test.p is not None]
     if not known:

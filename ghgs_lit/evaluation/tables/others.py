@@ -1,4 +1,4 @@
-"""Results of other methods, from JSON files that ``docs/tables.md`` describes."""
+"""Results of other methods, from JSON files in the format that ``docs/tables.md`` describes."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,7 +33,7 @@ class _Row(_Exact):
 
 
 class _Others(_Exact):
-    """Another method's file, which ``docs/tables.md`` describes."""
+    """A results file of another method."""
 
     format: Literal["ghgs_lit.others"]
     format_version: Literal[1]
@@ -43,14 +43,14 @@ class _Others(_Exact):
 
 
 def read_others(path: Path) -> pd.DataFrame:
-    """Rows of another method's results file, like those of :class:`ghgs_lit.evaluation.tables.runs.Sweep`.
+    """Read the results file of another method.
 
     Args:
-        path: JSON file of the format above.
+        path: JSON file in the format of ``docs/tables.md``.
 
     Returns:
-        Rows; ``origin`` is the file's ``source``; means have no ``subject`` and may have a
-        ``count`` of subjects.
+        Rows as in :class:`ghgs_lit.evaluation.tables.runs.Sweep`. ``origin`` is the file's
+        ``source``. Means have no ``subject``, and optionally a ``count`` of subjects.
 
     Raises:
         FileNotFoundError: There is no such file.

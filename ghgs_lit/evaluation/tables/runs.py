@@ -27,13 +27,15 @@ from ghgs_lit.runs.results import METHOD, read_results, validated
 from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]
-"""What numbers in one column must have in common."""
+"""Columns whose values all numbers in a column of a table share."""
 TRAINING = {"steps": ("steps", 1), "seconds": ("seconds", 1), "peak_gb": ("peak_bytes", 1e9)}
-"""Metrics of the training, which no subject has, with their keys in the provenance and units."""
+"""Metrics of the training, which are not per subject: key in the provenance, and divisor to the
+printed unit."""
 
 
 class Planned(NamedTuple):
-    """A training run without results yet: its row, data set, numbers of input views (None: unknown), seed."""
+    """A training run without results: its row, data set, numbers of input views (None: unknown) and
+    seed."""
 
     variant: Variant
     data: str
@@ -48,9 +50,9 @@ class Sweep:
     Attributes:
         rows: One for each run, method, number of views, target protocol and subject, with
             ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the
-            configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over
-            the subject's targets; and ``trained_views``, the number of views of models that share a
-            row because each was trained with another one.
+            configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over the
+            subject's targets; and ``trained_views``, the number of views in training of models that
+            share a row and were each trained with a different one.
         planned: Training runs without results.
         configs: Configuration of our model by ``source``.
         order: Variants of our models in the order of rows.
@@ -89,7 +91,7 @@ class _Training(_Strict):
 class _Provenance(_Strict):
     config: dict[str, Any]
     config_hash: str | None = None
-    # Of `ghgs evaluate`: how the model was trained, and what the command line changed in it.
+    # Written by `ghgs evaluate`: the training's configuration, and its changes on the command line.
     checkpoint_config: dict[str, Any] | None = None
     changed_model: dict[str, Any] | None = Field(None, alias="model_config")
     seed: int | None = None
@@ -100,8 +102,8 @@ class _Provenance(_Strict):
 
 
 def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as
-    trained and measured."""
+    """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as trained
+    and measured."""
     content = read_results(path)
     source = validated(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
@@ -129,7 +131,7 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
 
 
 def _read_training(path: Path) -> dict[str, Any] | None:
-    """The ``config.yaml`` of a training run; None: it is another command's or incomplete."""
+    """The ``config.yaml`` of a training run; None: it belongs to another command or is incomplete."""
     try:
         config = read_yaml(path)
     except InputError:
@@ -142,13 +144,13 @@ def _read_training(path: Path) -> dict[str, Any] | None:
 
 
 def natural(text: str) -> list[str | float]:
-    """Key that sorts texts by the numbers in them, so that ``k=10`` comes after ``k=9``."""
+    """Sort key that compares numbers in texts by value: ``k=10`` comes after ``k=9``."""
     parts = re.split(r"(\d+(?:\.\d+)?(?:e[-+]?\d+)?)", text)
     return [float(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
 def _in_order(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[str, Variant]) -> list[str]:
-    """Files of runs in the order of folders, then of the sweep's command, then of their rows' names."""
+    """Sort files of runs by folder, then as in the sweep's command, then by the names of their rows."""
     commands = {sweep: runs_in_order(sweep) for sweep in {Path(path).parent.parent for path in paths}}
 
     def place(path: str) -> tuple:
@@ -167,17 +169,17 @@ def _files_below(folders: Sequence[Path], name: str) -> list[Path]:
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
-    """All runs below folders, finished or not.
+    """Read all runs below folders, finished or not.
 
     Args:
         folders: Directories of sweeps or runs.
-        by: Configuration keys that distinguish rows beyond model, encoder, ablation and the views
-            and targets of the training.
+        by: Configuration keys that distinguish rows beyond model, encoder, ablation and the views and
+            targets of the training.
 
     Raises:
         FileNotFoundError: A folder is missing.
-        InputError: There is no finished run, a ``metrics.json`` is damaged,
-            or no run has a key of ``by``.
+        InputError: There is no finished run, a ``metrics.json`` is damaged, or no run has a key of
+            ``by``.
     """
     for folder in folders:
         if not folder.is_dir():
@@ -196,7 +198,7 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
     configs = {**models, **trainings}
     views = {} if TRAINING_COUNTS in by else find_views_of_columns(configs)
-    for path in views:  # which differ no more by the number of views in training
+    for path in views:  # one row, whatever the number of views in training
         configs[path] = {**configs[path], "views": {**configs[path]["views"], "training_counts": "as many"}}
     variants = name_variants(configs, list(dict.fromkeys([*by, *find_keys_of_rows(configs.values())])))
     frames = []

@@ -1,11 +1,11 @@
-"""Tests of differences between rows of a table, with intervals and what they could have found.
+"""Tests of differences between rows of a table, with intervals and smallest detectable differences.
 
 A value is the sum of a fixed effect of its row, random effects of the seed and the subject, which
 rows share, and their interactions with the row: a mixed model with crossed effects. Seeds are few:
-their variance is pooled over all rows of a column (residuals of the two-way table of rows and
-seeds). Subjects are many: each pair of rows has its own. The two squared standard errors are added
-(min F', Clark 1973), with the degrees of freedom of the smaller sample (Mickey and Brown 1966), so
-that the level holds whichever of the two varies more.
+their variance is pooled over all rows of a column (residuals of the two-way table of rows and seeds).
+Subjects are many: their variance is estimated for each pair of rows. The two squared standard errors
+are added (min F', Clark 1973), with the degrees of freedom of the smaller sample (Mickey and Brown
+1966), so that the level holds whichever of the two varies more.
 """
 
 import math
@@ -25,11 +25,10 @@ RATIO = 2.0
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a row with the reference row of its column,
-    on the seeds and subjects that both have.
+    """Comparison of a row with the reference row of its column, on the seeds and subjects of both.
 
-    Interval, p-values and all that follows from them are None with fewer than two
-    seeds or subjects.
+    With fewer than two seeds or subjects, the interval, the p-values and all values derived from them
+    are None.
 
     Attributes:
         seeds: Number of seeds.
@@ -38,10 +37,10 @@ class Comparison:
         low: Lower end of its interval at level 1 - alpha, not corrected.
         high: Upper end of that interval.
         p: Two-sided p-value.
-        corrected: The same, corrected by Holm.
+        corrected: p-value after Holm's correction.
         error: Standard error of the difference.
         freedom: Degrees of freedom of the error.
-        smallest: The difference that is found with a probability of ``POWER`` among all
+        smallest: The difference that is detected with a probability of ``POWER`` among all
             comparisons of the table.
     """
 
@@ -73,20 +72,21 @@ class Pool:
 
     @property
     def allowance(self) -> float:
-        """Factor by which the variance of a difference can exceed twice the pooled one, if the
+        """Ratio of the largest possible variance of a difference to twice the pooled variance, if the
         deviation of the reference is ``RATIO`` times that of the others; 1 for two rows."""
         return (RATIO**2 + 1) * self.rows / (2 * (RATIO**2 + self.rows - 1))
 
 
 def pool(rows: Sequence[pd.DataFrame]) -> Pool:
-    """Pool the variance of rows over seeds. Each row counts with the subjects that it has at all
-    its seeds; rows may lack seeds.
+    """Pool the variance of rows over seeds.
+
+    Each row is averaged over the subjects that it has at all its seeds. Rows may lack seeds.
 
     Args:
         rows: Values of each row by seed (index) and subject (columns).
 
     Returns:
-        The variance with its degrees of freedom, 0 if it is not known.
+        The variance; its degrees of freedom are 0 if it cannot be estimated.
     """
     means = [row.dropna(axis="columns").mean(axis="columns") for row in rows]
     table = pd.concat(means, axis="columns").to_numpy()
@@ -95,8 +95,7 @@ def pool(rows: Sequence[pd.DataFrame]) -> Pool:
     seed, row = np.nonzero(known)
     if not len(seed):
         return Pool(0.0, 0, 0)
-    # Effects of seeds are taken out of values and of the rows' indicators (Frisch,
-    # Waugh and Lovell).
+    # Partial out the effects of seeds from values and row indicators (Frisch-Waugh-Lovell).
     values = (table - np.nanmean(table, axis=1, keepdims=True))[seed, row]
     indicators = np.eye(len(rows))[row] - (known / known.sum(axis=1, keepdims=True))[seed]
     effects, _, rank, _ = np.linalg.lstsq(indicators, values)
@@ -135,8 +134,8 @@ def compare(
 
 
 def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) -> float:
-    """Difference that is significant with a probability of ``POWER``,
-    by the noncentral t distribution.
+    """Difference that is significant with a probability of ``POWER``, by the noncentral t
+    distribution.
 
     Args:
         comparison: With its standard error and degrees of freedom.
@@ -153,13 +152,13 @@ def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) 
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Holm's correction of the p-values of a table (Holm 1979).
+    """Holm's correction of p-values (Holm 1979).
 
     Args:
-        values: p-values of all comparisons.
+        values: p-values of all comparisons of a table.
 
     Returns:
-        Corrected ones in the same order, at most 1.
+        Corrected p-values in the same order, at most 1.
     """
     order = np.argsort(values, kind="stable")
     scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)

@@ -25,7 +25,7 @@ from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.results import config_hash
 
 ABSENT = "absent"
-"""Text of a value that a configuration does not have."""
+"""Text for a key that a configuration does not have."""
 TRAINING_COUNTS = "views.training_counts"
 #: Titles of keys that distinguish rows without being named by the user.
 _KEY_TITLES = {
@@ -47,15 +47,16 @@ class Variant:
     """Identity of a row of a table.
 
     Attributes:
-        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
-        name: Of the method.
-        model: Name of the model, with what sets it apart from the shipped one; empty for other methods.
+        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the
+            paper).
+        name: Name of the method.
+        model: Name of the model, with its differences from the shipped one; empty for other methods.
         encoder: Name of its encoder; empty for other methods.
         ablation: The chosen option; empty for other methods.
         switches: Whether its 3D unprojection and semantic consistency are on.
-        has_semantics: Whether the semantic features were trained (published weights or `ghgs pretext`);
-            unknown before training starts, so it does not distinguish rows.
-        extra: Further configuration keys and values that do.
+        has_semantics: Whether the semantic features were trained (published weights or `ghgs
+            pretext`); unknown before training starts, so it does not distinguish rows.
+        extra: Further configuration keys and values that distinguish rows.
     """
 
     kind: str
@@ -69,12 +70,12 @@ class Variant:
 
     @property
     def is_own(self) -> bool:
-        """Whether this is a row of a user's own ablation."""
+        """Whether this is a row of a user-defined ablation."""
         return bool(self.ablation) and is_own_ablation(self.ablation)
 
     @property
     def titles(self) -> list[str]:
-        """What distinguishes the row beyond model, encoder and ablation, in words."""
+        """Differences of the row beyond model, encoder and ablation, in words."""
         return [_KEY_TITLES.get(key, key + "={}").format(value.strip("[]")) for key, value in self.extra]
 
     @property
@@ -95,27 +96,28 @@ def encoder_name(config: Mapping[str, Any]) -> str:
         config: Resolved configuration of a training.
 
     Returns:
-        The option of conf/encoder with its sizes, or ``unnamed``, and whether it has a semantic branch.
+        The option of conf/encoder with these sizes, or ``unnamed``, followed by ``, semantic branch``
+        if it has one.
     """
     encoder = config.get("encoder")
     encoder = encoder if isinstance(encoder, Mapping) else {}
     branch = ", semantic branch" * (encoder.get("semantic") is not None)
     values = flatten({key: encoder.get(key) for key in _ENCODER_KEYS})
     for name, shipped in sorted(_shipped("encoder").items()):
-        # A file lists of a nested mapping only what differs from the file below it.
+        # A file overrides single keys of nested mappings.
         if flatten({key: shipped.get(key) for key in _ENCODER_KEYS}).items() <= values.items():
             return name + branch
     return "unnamed" + branch
 
 
 def ablation_sets(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted keys with the values that the chosen ablation of a training sets; empty if unknown."""
+    """Dotted keys and values set by the chosen ablation of a training; empty if unknown."""
     sets = lookup(config, "chosen.sets")
     return dict(sets) if isinstance(sets, Mapping) else {}
 
 
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
-    """The row that a model belongs to.
+    """The table row of a model.
 
     Args:
         config: Configuration of the model as trained and measured.
@@ -123,34 +125,37 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
         by: Keys that distinguish rows beyond model, encoder and ablation.
 
     Raises:
-        InputError: The configuration has no recalibration, of which the ablation takes parts away.
+        InputError: The configuration has no recalibration, whose parts the ablation switches.
     """
     recalibration = config.get("recalibration")
     require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")
     ablation = ablation_of(config)
     encoder = encoder_name(config)
-    # A user's option of conf/model may have kept the name of the one that it changes.
+    # A user-defined option of conf/model can have the name of the one that it is based on.
     model = lookup(config, "chosen.model")
     if model is None or model in _shipped("model"):
         model = str(lookup(config, "model.name") or "unnamed")
     model += f", compat {compat}" * (compat not in (None, "none"))
-    # What a user's ablation changes is a row of the model's table, not another model. The paper's
-    # ablations find neighbours in 3D or on the image plane.
+    # A user-defined ablation is a row of the model's table, not another model. The paper's ablations
+    # find neighbours in 3D or on the image plane.
     if is_own_ablation(ablation):
         if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
             encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
     elif recalibration.get("neighborhood") == "feature":
         model += ", neighbours by feature"
     extra = tuple((key, str(lookup(config, key))) for key in by)
-    # Without such weights the encoder has learned from the rendering loss only.
+    # Without such weights the encoder was trained by the rendering loss only.
     has_semantics = bool(lookup(config, "encoder.weights"))
     return Variant("model", "ours", model, encoder, ablation, switches_of(config), has_semantics, extra)
 
 
 def find_views_of_columns(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Numbers of views by file of models that fill one column each: models on the same data that were
-    trained with one number of views each, and not all with the same one."""
+    """Number of views in training, by file, of models that fill one column each.
+
+    These are models on the same data that were each trained with a single number of views, if these
+    numbers differ.
+    """
     counts: dict[str, dict[str, int]] = {}
     for path, config in configs.items():
         trained = lookup(config, TRAINING_COUNTS)
@@ -161,8 +166,11 @@ def find_views_of_columns(configs: Mapping[str, Mapping[str, Any]]) -> dict[str,
 
 
 def find_keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Keys of views and targets in which runs that could share a row differ: runs on the same data
-    by how they were trained, those with a protocol of the same name by its targets."""
+    """Keys of views and targets in which runs that could share a row differ.
+
+    Keys of the training are compared between runs on the same data; keys of the targets between those
+    with a protocol of the same name, too.
+    """
     values: dict[tuple[str, ...], set[str]] = {}
     for config in configs:
         data = str(lookup(config, "data.name"))
@@ -174,8 +182,11 @@ def find_keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def name_variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:
-    """Variants by file. Models of one configuration have one row, whatever their ablations are called:
-    by the paper's name if one has it."""
+    """Variants by file.
+
+    Models of equal configuration have one row, whatever their ablations are called; the paper's name
+    of the ablation precedes others.
+    """
     variants = {path: model_variant(config, path, by) for path, config in configs.items()}
     keys = {path: config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for path, config in configs.items()}
     names: dict[str, str] = {}
@@ -188,11 +199,14 @@ def name_variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -
 def differing(
     configs: Sequence[Mapping[str, Any]], expected: Iterable[str] = EXPECTED_TO_DIFFER
 ) -> dict[str, list[str]]:
-    """Dotted keys in which configurations differ, with their values as text, ``ABSENT`` among them.
+    """Find the dotted keys in which configurations differ.
 
     Args:
-        configs: Of several runs.
+        configs: Configurations of several runs.
         expected: Keys that may differ, with those below them.
+
+    Returns:
+        Different values of each key as text, ``ABSENT`` where a configuration does not have it.
     """
     flat = [flatten(config) for config in configs]
     texts = {}

@@ -22,16 +22,15 @@ COLUMNS = (
     "test_high", "test_p", "test_p_holm", "test_smallest", "runs",
 )  # fmt: skip
 NO_FIGURE = "-"
-"""Where there is no figure, as the paper prints it."""
+"""Text of a cell without a number, as in the paper."""
 BEST = " ◂"
 """Mark of the best value in a terminal."""
 Write = Callable[[str, str, bool], str]
-"""Writes a cell of its number, what follows it, and whether it is best."""
+"""Formats a cell from its number, the text after the number, and whether it is best."""
 
 
 def _cell(cell: Any, write: Write) -> str:
-    """A cell as printed: number, deviation over seeds, mark, interval of its difference,
-    missing seeds."""
+    """Format a cell: number, deviation over seeds, mark, interval of its difference, missing seeds."""
     if pd.isna(cell.mean):
         return write("missing" if cell.lacking else NO_FIGURE, "", False)
     digits = metric_of(cell.Index[2]).decimals
@@ -40,20 +39,20 @@ def _cell(cell: Any, write: Write) -> str:
         tail += MARK
     if cell.test is not None and cell.test.low is not None:
         ends = [f"{end:+z.{digits}f}" for end in (cell.test.low, cell.test.high)]
-        tail += f" [{', '.join(ends)}]" if any(map(float, ends)) else ""  # equal rows differ by nothing
+        tail += f" [{', '.join(ends)}]" if any(map(float, ends)) else ""  # no interval for equal rows
     if cell.lacking:
         tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
     return write(f"{cell.mean:.{digits}f}", tail, cell.best)
 
 
 def _texts(table: Table, write: Write) -> pd.DataFrame:
-    """Cells as printed: a row for each line, columns by group and metric."""
+    """Formatted cells: a row for each line, columns by group and metric."""
     cells = [_cell(cell, write) for cell in table.cells.itertuples()]
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
 def _blocks(table: Table, write: Write) -> dict[str, list[tuple[str, list[str]]]]:
-    """Kind and cells of each line by the title of its block: the reported ones, then the measured ones."""
+    """Kind and cells of each line by the title of its block: reported lines, then measured ones."""
     numbers = _texts(table, write)
     blocks: dict[str, list[tuple[str, list[str]]]] = {}
     for number, (variant, stub) in enumerate(table.lines):
@@ -64,7 +63,7 @@ def _blocks(table: Table, write: Write) -> dict[str, list[tuple[str, list[str]]]
 
 
 def to_markdown(table: Table) -> str:
-    """The table as Markdown, with its caption above and its notes below."""
+    """Write the table as Markdown, with its caption above and its notes below."""
 
     def write(number: str, tail: str, best: bool) -> str:
         text = number + tail.replace(MARK, rf"\{MARK}")
@@ -87,8 +86,8 @@ def to_markdown(table: Table) -> str:
 
 
 def to_terminal(table: Table) -> str:
-    """The table for a terminal, with caption and notes; each group of columns has its own lines, so that
-    no table is wide."""
+    """Write the table for a terminal, with caption and notes; each group of columns has its own
+    lines, which limits the width."""
     numbers = _texts(table, lambda number, tail, best: number + tail + BEST * best)
     rows = []
     for (i, line), (number, group) in itertools.product(enumerate(table.lines), enumerate(table.groups)):
@@ -102,7 +101,8 @@ def to_terminal(table: Table) -> str:
 
 
 def to_csv(tables: Sequence[Table]) -> str:
-    """All cells with all digits, a line each, by ``COLUMNS``; the mean is empty if a run is missing."""
+    """Write all cells with all digits, a line each, by ``COLUMNS``; the mean is empty if a run is
+    missing."""
     lines = []
     for number, table in enumerate(tables, 1):
         for cell in table.cells.itertuples():
@@ -113,10 +113,10 @@ def to_csv(tables: Sequence[Table]) -> str:
 
 
 def _about_row(table: Table, cell: Any) -> dict[str, Any]:
-    """What a cell is about, by column."""
+    """Row, setting and metric of a cell, by column of the CSV file."""
     variant, stub = table.lines[cell.Index[0]]
     group = table.groups[cell.Index[1]]
-    # Our splits, targets and protocols do not apply to the paper's figures.
+    # Splits, targets and protocols of our runs do not apply to the paper's figures.
     setting = {"data": table.reported_on} if variant.kind == "reported" else table.rows.iloc[0]
     unprojection, semantic = variant.switches or (None, None)
     return {
@@ -136,7 +136,7 @@ def _about_row(table: Table, cell: Any) -> dict[str, Any]:
 
 
 def _figures(table: Table, cell: Any) -> dict[str, Any]:
-    """Figures of a cell, by column; none where there is no number."""
+    """Figures of a cell, by column of the CSV file; empty without a number."""
     if pd.isna(cell.mean):
         return {}
     figures = {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
@@ -168,7 +168,7 @@ _FLOAT = r"""\begin{%(float)s}[t]
 \label{%(label)s}
 \end{%(float)s}
 """
-"""Rows can be wide; the paper scales its tables to the line, too."""
+"""Wide tables are scaled to the line width, as in the paper."""
 _WIDE = 7
 """Minimum number of columns of a table that spans both columns of the page."""
 _ESCAPES = {
@@ -180,12 +180,12 @@ _ESCAPES = {
 
 
 def escape(text: str) -> str:
-    """Plain text as LaTeX."""
+    """Escape plain text for LaTeX."""
     return text.translate(str.maketrans(_ESCAPES))
 
 
 def prose(text: str) -> str:
-    """Markdown with ``**bold**`` and names in backticks as LaTeX."""
+    """Convert Markdown with ``**bold**`` and names in backticks to LaTeX."""
     text = re.sub(r"\*\*([^*]+)\*\*", r"\\textbf{\1}", escape(text))
     return re.sub(r"`([^`]*)`", r"\\texttt{\1}", text)
 
@@ -196,7 +196,8 @@ def _number(number: str, tail: str, best: bool) -> str:
 
 
 def _columns(table: Table) -> str:
-    """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for data sets)."""
+    """Column specification: ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; data sets without
+    the first bar)."""
     if table.is_ablation and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = " ".join("c" * len(table.stub)) if len(table.stub) > 1 else "l"
@@ -241,7 +242,8 @@ def _tabular(table: Table) -> str:
 
 
 def to_latex(table: Table, label: str) -> str:
-    """A float with the table, its caption, notes in small print and label; needs ``PREAMBLE``."""
+    """Write a float with the table, its caption, notes in small print, and label; requires
+    ``PREAMBLE``."""
     notes = "\n".join(rf"{prose(note)}\par" for note in table.notes)
     parts = {
         "float": "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table",
