@@ -1,7 +1,7 @@
 """Turn a user's photographs and calibration into splat files, web pages and weights for their rig.
 
-A plug-in of :mod:`ghgs_lit` through the same entry point as a user's plug-in: it registers the commands
-for photographs, and the instants of a sequence as a data set.
+A plug-in of :mod:`ghgs_lit`, loaded through the same entry point as a user's: it registers the verbs for
+photographs, and the data set ``instants`` for the instants of a sequence.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Export predictions to files for other programs: one table of formats, one function that writes all."""
+"""Export predictions to files for other programs, in the formats of ``FORMATS``."""
 
 from ghgs_capture.export.instants import Instants
 from ghgs_capture.export.prediction import SHEET, output_files, output_options, write_prediction

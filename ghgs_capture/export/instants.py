@@ -1,4 +1,4 @@
-"""Files of several instants together: a page that plays them, numbered PLYs and a video."""
+"""Files that cover several instants: a page that plays them, numbered PLYs and a video."""
 
 import math
 import os
@@ -21,9 +21,9 @@ from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import orbit
 
-#: Largest angle of the video's camera to each side of the first photograph, in radians
+#: Largest angle, in radians, by which the video's camera swings to each side of the first photograph
 _SWING = math.radians(20)
-_VIDEO_SIDE = 720  #: Least length of its pictures' longer side in pixels
+_VIDEO_SIDE = 720  #: Least length of the longer side of its frames, in pixels
 
 
 class Instants:
@@ -35,7 +35,7 @@ class Instants:
 
     Args:
         count: largest number of instants.
-        options: formats, upward axis and pictures a second.
+        options: formats, upward axis and frames per second.
         others: names of further files, whose contents must be set in the attribute ``others`` before
             :meth:`write`.
     """
@@ -142,7 +142,7 @@ class Instants:
 
         def picture(frame: int) -> np.ndarray:
             gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
-            # Without it, large frames would show gaps.
+            # Large frames would show gaps otherwise.
             gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
             return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
 
@@ -156,7 +156,7 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-# Without these, players guess the colour matrix and range.
+# Players guess the colour matrix and range otherwise.
 _COLORS = (
     "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
 )

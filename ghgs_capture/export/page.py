@@ -1,4 +1,4 @@
-"""A single HTML file that shows Gaussians in any browser with WebGL 2, without a network."""
+"""A single HTML file that shows Gaussians in any browser with WebGL 2, without network access."""
 
 import base64
 import html
@@ -17,11 +17,11 @@ from ghgs_capture.export.subject import ExportedSubject
 from ghgs_lit.ply import stored_values
 from ghgs_lit.types import Gaussians
 
-#: Quantisation steps in a pixel of a photograph (centre), a factor of e (standard deviation) and 1
-#: (opacity; rotation, to each side of 0): ``FINE`` for one instant, ``COARSE`` for each of several.
+#: Quantisation steps per pixel of a photograph (centre), per factor of e (standard deviation) and per
+#: unit (opacity, rotation): ``FINE`` for one instant, ``COARSE`` for each of several.
 FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
 COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
-#: Numbers of each Gaussian that take four bytes (its centre) and one byte (the others).
+#: Numbers of each Gaussian that are stored in four bytes (its centre) and in one byte (the others)
 _WIDE = 3
 _NARROW = 10
 _LARGEST = 1 << 29
@@ -30,10 +30,10 @@ _LARGEST = 1 << 29
 def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
     """Quantise and compress Gaussians to byte planes [22, N], which ``page.html`` unpacks.
 
-    Each Gaussian is converted to integers: its centre relative to ``center`` in parts of ``pixel``; the
-    logarithms of its standard deviations; colour and opacity; and its rotation as ``v / (1 + w)``
-    of the unit quaternion ``(w, v)`` with ``w >= 0``. Each number is stored as the difference from the
-    previous Gaussian, which is mostly a neighbour.
+    Each Gaussian is converted to integers: its centre relative to ``center`` in fractions of ``pixel``;
+    the logarithms of its standard deviations; colour and opacity; and its rotation as ``v / (1 + w)`` of
+    the unit quaternion ``(w, v)`` with ``w >= 0``. Each number is stored as the difference from the
+    previous Gaussian, which is usually a neighbour.
 
     Args:
         gaussians: of one subject, with RGB colours.
@@ -54,7 +54,7 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
         v * torch.where(w < 0, -1, 1) / (1 + w.abs()) * steps["rotation"],
     )
     numbers = torch.cat([part.round().long() for part in parts], dim=1).numpy()
-    numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue are like green
+    numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue are similar to green
     wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
     # with the sign as the last bit, high bytes are mostly 0
     wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")
@@ -68,9 +68,9 @@ def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], 
 
     Args:
         data: the packed bytes.
-        pixel: as given to :func:`pack`.
-        center: as given to :func:`pack`.
-        steps: as given to :func:`pack`.
+        pixel: as for :func:`pack`.
+        center: as for :func:`pack`.
+        steps: as for :func:`pack`.
         like: Gaussians whose image constants (``low_pass``, ``antialiased``) are copied.
 
     Returns:
@@ -110,14 +110,14 @@ def page(
     """Create a page that shows one instant or plays several, with a button for each camera.
 
     Args:
-        subject: the first instant; the page begins at its first camera.
+        subject: the first instant; the page starts at its first camera.
         name: title of the page, as plain text.
-        packed: :func:`pack` of each of several instants, with ``COARSE``; none: the subject alone.
+        packed: :func:`pack` of each of several instants, with ``COARSE``; empty: only the subject.
         path: translation [instants, 3] of the page's camera at each instant.
         fps: instants per second.
 
     Returns:
-        The text of an HTML file.
+        The content of the HTML file.
     """
     gaussians = subject.gaussians
     cameras = subject.cameras

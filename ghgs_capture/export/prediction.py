@@ -1,4 +1,4 @@
-"""The files of a prediction: one entry of ``FORMATS`` for each format."""
+"""Write the files of a prediction, with an entry of ``FORMATS`` for each format."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,22 +32,22 @@ from ghgs_lit.visualization.pictures import palette, sheet, to_uint8
 if TYPE_CHECKING:
     from ghgs_capture.verbs import Predict
 
-SHEET = "sheet.png"  #: The picture to look at
-#: Formats that the package gaussforge makes from a PLY; what it, and the suffix of files, calls each.
+SHEET = "sheet.png"  #: Overview of inputs, renderings and depth
+#: Formats that the package gaussforge converts a PLY to, with its name for each, also the file suffix
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
 
 
 def half_turned(gaussians: Gaussians) -> Gaussians:
-    """Turn Gaussians by half a turn about x: from a PLY's axes (right, down, front) to those in
-    which SPZ is stored (right, up, back), or back.
+    """Rotate Gaussians by 180 degrees about x, between the axes of a PLY (right, down, front) and of SPZ
+    (right, up, back).
 
-    https://github.com/nianticlabs/spz, "Coordinate System"; gaussforge stores numbers as they are.
+    https://github.com/nianticlabs/spz, "Coordinate System"; gaussforge does not convert axes.
 
     Args:
-        gaussians: of any number of subjects; their colours must not depend on direction.
+        gaussians: of any number of subjects, with view-independent colours.
 
     Returns:
-        The same with y and z of places, and with them those of quaternions, negated.
+        The Gaussians with y and z of means and quaternions negated.
     """
     means = gaussians.means * gaussians.means.new_tensor([1, -1, -1])
     quaternions = gaussians.quaternions * gaussians.quaternions.new_tensor([1, 1, -1, -1])
@@ -55,19 +55,19 @@ def half_turned(gaussians: Gaussians) -> Gaussians:
 
 
 def converted(name: str, gaussians: Gaussians) -> bytes:
-    """Convert Gaussians to another program's format, by the package gaussforge.
+    """Convert Gaussians to another program's format with the package gaussforge.
 
     Args:
         name: of the format, in ``CONVERTED``.
         gaussians: of one subject, with RGB colours.
 
     Returns:
-        The content of a file.
+        The content of the file.
 
     Raises:
-        InputError: gaussforge cannot convert them, such as none.
+        InputError: gaussforge cannot convert them, for example if there are none.
     """
-    from gaussforge import GaussForge  # here: of an extra
+    from gaussforge import GaussForge  # here: optional dependency
 
     if name == "spz":
         gaussians = half_turned(gaussians)
@@ -79,13 +79,13 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
 
 
 def png(picture: np.ndarray) -> bytes:
-    """Encode a picture as PNG.
+    """Encode an image as PNG.
 
     Args:
-        picture: [h, w, 3], or with alpha [h, w, 4], uint8.
+        picture: [h, w, 3] or, with alpha, [h, w, 4], uint8.
 
     Returns:
-        The content of a file.
+        The content of the file.
     """
     content = BytesIO()
     Image.fromarray(picture).save(content, format="PNG")
@@ -93,13 +93,10 @@ def png(picture: np.ndarray) -> bytes:
 
 
 def depth_file(subject: ExportedSubject) -> bytes:
-    """Depth maps as exact numbers.
-
-    Args:
-        subject: with depths of each view.
+    """Encode depth maps and cameras as NPZ.
 
     Returns:
-        The content of an NPZ with ``depth`` [V, H, W] float32 (nan: none), ``intrinsics``,
+        The content of a file with ``depth`` [V, H, W] float32 (NaN where unknown), ``intrinsics``,
         ``extrinsics`` and ``views``.
     """
     depth = torch.where(subject.depth_valid, subject.depth.float(), torch.nan).cpu().numpy()
@@ -110,17 +107,14 @@ def depth_file(subject: ExportedSubject) -> bytes:
 
 
 def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Photographs and cameras, as ``ghgs predict images=inputs cameras=cameras.json`` reads them.
-
-    Args:
-        subject: with its photographs.
+    """Photographs and cameras, readable by ``ghgs predict images=inputs cameras=cameras.json``.
 
     Yields:
-        Functions that make a PNG of each view as the model saw it, with matte or mask as alpha,
-        then the JSON of the cameras.
+        Functions that encode each input view of the model as PNG, with matte or mask as alpha; last
+        one that encodes the cameras as JSON.
     """
     for image, matte in zip(subject.images, subject.mattes, strict=True):
-        colors = to_uint8(unmultiplied(image, matte))  # PNG's colours are not premultiplied
+        colors = to_uint8(unmultiplied(image, matte))  # colours in PNG are not premultiplied
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
         yield partial(png, np.concatenate([colors, alpha], -1))
     cameras = subject.cameras
@@ -132,20 +126,20 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 @dataclass(frozen=True)
 class Format:
-    """One format. ``contents`` gives a function for each file, in order;
-    threads call it for the content."""
+    """A format. ``contents`` returns a function for each file, in order, which computes its content in a
+    thread."""
 
-    files: tuple[str, ...]  #: names; one for each ``{view}``, or ``{frame}`` of the turntable
+    files: tuple[str, ...]  #: names; with ``{view}`` or ``{frame}`` one for each view or turntable image
     contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
-    package: str | None = None  #: package that it needs
-    extra: str = "formats"  #: extra of this package that installs it
+    package: str | None = None  #: optional package that the format needs
+    extra: str = "formats"  #: extra of this distribution that installs the package
 
     def names(self, views: Sequence[str], frames: int) -> list[str]:
-        """The names of all files.
+        """Names of all files.
 
         Args:
             views: names of the photographs.
-            frames: number of pictures of the turntable.
+            frames: number of images of the turntable.
         """
         names = []
         for pattern in self.files:
@@ -163,8 +157,7 @@ def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubje
 
 
 def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubject], list]:
-    """Contents of one file from the Gaussians for other viewers,
-    which are made before threads begin."""
+    """Contents of one file of the Gaussians for other viewers, which are fitted before threads start."""
     return lambda subject: [partial(content, subject.for_other_renderers)]
 
 
@@ -188,13 +181,7 @@ FORMATS: dict[str, Format] = {
 
 
 def output_options(verb: "Predict") -> OutputOptions:
-    """What a verb writes, checked before any work.
-
-    Args:
-        verb: its options.
-
-    Returns:
-        The choices for files.
+    """Read a verb's options for files, checked before any work.
 
     Raises:
         InputError: an unknown format, no frames for a video, or a package that is not installed.
@@ -212,14 +199,11 @@ def output_options(verb: "Predict") -> OutputOptions:
 
 
 def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
-    """List what :func:`write_prediction` writes into its directory.
+    """Names of the files that :func:`write_prediction` writes, except the report.
 
     Args:
-        options: formats and number of pictures of the turntable.
+        options: formats and number of images of the turntable.
         views: names of the photographs.
-
-    Returns:
-        Names of the files, except the report.
     """
     names = []
     for format in options.formats:
@@ -236,30 +220,30 @@ def write_prediction(
     options: OutputOptions,
     facts: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write the prediction of one subject, ``sheet.png`` to look at and ``report.json`` about it.
+    """Write the prediction of one subject, with an overview ``sheet.png`` and ``report.json``.
 
     Lengths in the files are in the unit of the batch's cameras.
 
     Args:
-        directory: files of an earlier prediction are replaced, others stay.
-        batch: photographs, masks and cameras of the subject; the sheet compares renders with its
-            targets, or with the photographs where it has none.
-        prediction: of this batch, in the world of its cameras.
-        renderer: draws the turntable, and the input views for the report.
-        options: formats and choices for them.
+        directory: files of an earlier prediction are replaced, others remain.
+        batch: photographs, masks and cameras of the subject; the overview compares renderings with its
+            targets, or with the photographs if it has none.
+        prediction: for this batch, in the world of its cameras.
+        renderer: renders the turntable, and the input views for the report.
+        options: formats and their options.
         facts: further plain data for the report.
 
     Returns:
-        The paths, that of ``report.json`` last.
+        The paths of the files, ``report.json`` last.
 
     Raises:
-        InputError: several subjects, or a file of another origin is in the way.
+        InputError: there are several subjects, or a file that no prediction wrote would be replaced.
     """
     subject = exported_subject(batch, prediction, renderer, options)
     names = output_files(options, subject.views)
     begin_files(directory, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
-        pool.submit(palette, "turbo")  # imports matplotlib, which the sheet needs, meanwhile
+        pool.submit(palette, "turbo")  # imports matplotlib for the overview in the background
         tasks = []
         for name in options.formats:
             files = FORMATS[name].names(subject.views, options.frames)
@@ -276,8 +260,7 @@ def write_prediction(
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:
-    """Plain data about a prediction: counts, lengths in the unit of the cameras,
-    PSNR of the inputs."""
+    """Plain data about a prediction: counts, lengths in the unit of the cameras, PSNR of input views."""
     gaussians = subject.gaussians
     drawn = subject.renderer(gaussians, subject.cameras[None])
     image = drawn.image[0].clamp(0, 1)

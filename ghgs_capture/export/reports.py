@@ -11,7 +11,7 @@ from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.parsing import read_json
 from ghgs_lit.runs.results import plain
 
-REPORT = "report.json"  #: Name of the file that lists the others
+REPORT = "report.json"  #: Name of the report
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
@@ -20,7 +20,7 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
     Args:
         directory: where files will be written.
         names: of the files, relative to the directory; the report is checked, too.
-        inputs: files that are read.
+        inputs: input files of the prediction.
 
     Raises:
         InputError: a file would be replaced; the message names the first one.

@@ -1,5 +1,4 @@
-"""One subject as its files hold it: prediction, photographs and cameras,
-in the frame of the files."""
+"""A subject as exported: Gaussians, photographs and cameras, in the coordinate frame of the files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +22,12 @@ AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
-    """The shortest rotation from one direction to another.
+    """Compute the shortest rotation from one direction to another.
 
     Args:
         start: unit vector.
-        end: unit vector; if opposite to ``start``, the rotation is half a turn about any axis at
-            right angles.
+        end: unit vector; if opposite to ``start``, the rotation is a half turn about some
+            perpendicular axis.
 
     Returns:
         The unit quaternion (w, x, y, z), float64.
@@ -37,7 +36,7 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
     end = end.double()
     axis = torch.linalg.cross(start, end)
     quaternion = torch.cat([(1 + start @ end)[None], axis])
-    if quaternion.norm() < 1e-7:  # opposite: half a turn about any axis at right angles
+    if quaternion.norm() < 1e-7:  # opposite: a half turn about a perpendicular axis
         other = torch.zeros_like(start).index_fill(0, start.abs().argmin(), 1)
         quaternion = torch.cat([start.new_zeros(1), torch.linalg.cross(start, other)])
     return torch.nn.functional.normalize(quaternion, dim=0)
@@ -46,15 +45,15 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
 def rotate_world(
     quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
 ) -> tuple[Gaussians, Cameras]:
-    """Rotate a whole scene.
+    """Rotate a scene.
 
     Args:
         quaternion: unit quaternion (w, x, y, z) of the rotation.
-        gaussians: their colours must not depend on direction.
-        cameras: of any number.
+        gaussians: with view-independent colours.
+        cameras: any number.
 
     Returns:
-        The same Gaussians and cameras in the rotated world, of the dtypes as given.
+        The Gaussians and cameras in the rotated world, with their dtypes.
     """
     quaternion = quaternion.double()
     rotation = quaternion_to_matrix(quaternion)
@@ -67,42 +66,42 @@ def rotate_world(
     return replace(gaussians, **values), moved
 
 
-#: Low-pass, in px^2, of other viewers' renderers, which are not antialiased.
+#: Low-pass, in px^2, of the renderers in other viewers, which are not antialiased
 VIEWER_LOW_PASS = 0.3
-_SMALLEST = 1e-3  #: Least standard deviation in pixels
-#: The fit of Gaussians for other viewers: changes, steps, cameras around the subject (beside the
-#: inputs), and views in each step.
+_SMALLEST = 1e-3  #: Least standard deviation, in pixels
+#: Fit of Gaussians to other viewers: changes, steps, cameras around the subject (in addition to the
+#: inputs), and views per step
 _FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
 _FIT_STEPS = 32
 _AROUND = 8
 _AT_ONCE = 2
-_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM (it would take half of the time) and silhouette
+_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM (which would double the time) and silhouette
 
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Choices for the files of a prediction."""
+    """Formats and options of exported files."""
 
-    formats: tuple[str, ...] = ("ply",)  #: names of :data:`ghgs_capture.export.prediction.FORMATS`
-    #: axis (``y``, ``-y``, ``z``) that points up in files; None: the cameras' world
+    formats: tuple[str, ...] = ("ply",)  #: keys of :data:`ghgs_capture.export.prediction.FORMATS`
+    #: axis (``y``, ``-y``, ``z``) that points up in files; None: files are in the cameras' world
     up: str | None = None
-    smooth: bool = False  #: files hold the :func:`smoothed` Gaussians
-    frames: int = 24  #: pictures of the turntable
-    fps: int = 12  #: pictures per second of the video
+    smooth: bool = False  #: files contain the :func:`smoothed` Gaussians
+    frames: int = 24  #: images of the turntable
+    fps: int = 12  #: images per second of the video
 
 
 def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
-    """Widen Gaussians by what a renderer adds in photographs.
+    """Apply the renderer's image constants to the Gaussians, at the photographs' resolution.
 
-    That is ``low_pass`` square pixels and, with ``antialiased``, the loss of opacity (exact for
-    round Gaussians; for others the geometric mean of their axes).
+    Variances grow by ``low_pass`` square pixels; with ``antialiased`` opacities decrease accordingly
+    (exact for isotropic Gaussians; for others by the geometric mean of their axes).
 
     Args:
         gaussians: with the renderer's image constants.
         pixel: side of a photograph's pixel at the subject, in the unit of the cameras.
 
     Returns:
-        Gaussians that need no constants: ``low_pass`` 0, not ``antialiased``.
+        Gaussians without constants: ``low_pass`` 0, not ``antialiased``.
     """
     variances = gaussians.scales.square()
     wider = variances + gaussians.low_pass * pixel**2
@@ -114,17 +113,17 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 
 def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
-    """Gaussians that 3D Gaussian Splatting's own renderer draws as ours draws the given ones.
+    """Convert Gaussians to the image constants of 3D Gaussian Splatting's renderer.
 
-    It always adds 0.3 px^2 and does not reduce opacity. Variances are reduced by what it adds too
-    much at the photographs' size; those that ours draws below 0.3 px^2 become points.
+    It always adds 0.3 px^2 and does not reduce opacity. The excess at the photographs' resolution is
+    subtracted from the variances; Gaussians that our renderer draws below 0.3 px^2 become points.
 
     Args:
         gaussians: with our renderer's image constants.
         pixel: side of a photograph's pixel at the subject, in the unit of the cameras.
 
     Returns:
-        Gaussians with that renderer's constants; the given ones where they have them already.
+        Gaussians that render alike there; the given ones if their constants are already the same.
     """
     if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
         return gaussians
@@ -135,13 +134,13 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 
 def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
-    """Optimise Gaussians to render more like others, in ``_FIT_STEPS`` steps.
+    """Optimise Gaussians in ``_FIT_STEPS`` steps so that their renderings match those of others.
 
     Args:
         theirs: Gaussians with the image constants of another renderer.
-        ours: what renders are compared with.
+        ours: Gaussians whose renderings are the targets.
         cameras: sets of cameras [n], used in turn.
-        renderer: draws both, with gradients.
+        renderer: renders both; must support gradients.
 
     Returns:
         ``theirs`` with changed scales, opacities and colours.
@@ -153,7 +152,7 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
         seen = cameras[among]
         wanted = drawn[among]
         count = seen.extrinsics.shape[0]
-        # Far apart, to see different sides.
+        # Far apart, so that a step covers different sides.
         views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
         part = (wanted.image[:, views], wanted.alpha[:, views], seen[views][None])
         search.step(renderer, part, _WEIGHTS)
@@ -164,8 +163,8 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
 class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the upward unit vector.
 
-    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``dropped`` counts
-    Gaussians that are not finite, which no renderer draws and no file holds."""
+    ``images`` are premultiplied by ``mattes`` (by the masks if the batch has no mattes). ``dropped`` is
+    the number of removed Gaussians that were not finite."""
 
     name: str
     views: tuple[str, ...]
@@ -183,15 +182,14 @@ class ExportedSubject:
 
     @cached_property
     def stored(self) -> Gaussians:
-        """The Gaussians of the PLY, which stores their image constants; with ``smooth`` they are
-        :func:`smoothed` (as in Mip-Splatting, Yu et al. 2024), so that a larger screen
-        shows no gaps."""
+        """Gaussians for the PLY, which stores their image constants; :func:`smoothed` with ``smooth``
+        (as in Mip-Splatting, Yu et al. 2024), so that larger screens show no gaps."""
         return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
-        """The Gaussians of files without image constants,
-        fitted to our renders of inputs and all around."""
+        """Gaussians for files without image constants, fitted to our renderings of the input views and
+        of views all around."""
         if self.options.smooth:
             return self.stored
         converted = for_other_renderers(self.gaussians, self.pixel)
@@ -202,22 +200,22 @@ class ExportedSubject:
 
     @cached_property
     def body(self) -> Float[Tensor, "n 3"]:
-        """The points that pictures of the whole subject must show."""
+        """Points that images of the whole subject must contain."""
         return subject_points(self.gaussians)
 
     @property
     def center(self) -> Float[Tensor, "3"]:
-        """The point that the page and the turntable turn about."""
+        """Point that the cameras of the page and of the turntable orbit."""
         return center_of(self.body, self.cameras)
 
     @property
     def pixel(self) -> float:
-        """The side of a photograph's pixel at the subject, in the unit of the cameras."""
+        """Side of a photograph's pixel at the subject, in the unit of the cameras."""
         return pixel_size(self.cameras, self.center)
 
     @cached_property
     def turntable(self) -> list[np.ndarray]:
-        """Pictures [h, w, 3] uint8 from all around."""
+        """Images [h, w, 3] uint8 from all around."""
         orbit = turntable(self.cameras, self.options.frames, self.body)
         seen = (orbit[frame : frame + 1][None] for frame in range(self.options.frames))
         return [to_uint8(self.renderer(self.gaussians, cameras).image[0, 0]) for cameras in seen]
@@ -226,21 +224,21 @@ class ExportedSubject:
 def exported_subject(
     batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
 ) -> ExportedSubject:
-    """The subject of a batch of one, in the frame that ``options`` choose.
+    """Convert the prediction for a batch of one subject to the frame of the files (``options.up``).
 
     Gaussians that are not finite are dropped.
 
     Args:
         batch: photographs, masks and cameras of one subject.
-        prediction: of this batch, in the world of its cameras.
-        renderer: draws pictures of the files.
-        options: the upward axis, and choices that go along.
+        prediction: for this batch, in the world of its cameras.
+        renderer: renders the images in the files.
+        options: kept with the subject.
 
     Returns:
         The subject, on the device of the prediction.
 
     Raises:
-        InputError: there are several subjects.
+        InputError: the batch has several subjects.
     """
     count = len(batch.images)
     require(count == 1, "write_prediction", "a batch of one subject", count)
@@ -276,11 +274,7 @@ def exported_subject(
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """Names of photographs made fit for file names, all different even without case.
-
-    Args:
-        views: names of the photographs.
-    """
+    """Convert names of photographs to valid file names that differ even if case is ignored."""
     names: dict[str, str] = {}
     for view in views:
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in view)

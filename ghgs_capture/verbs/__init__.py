@@ -1,7 +1,7 @@
-"""The verbs that work on a user's photographs: what each is for, its keys,
-and where its work begins.
+"""Verbs for a user's photographs, with their keys.
 
-The module that does the work is imported when the verb runs: ``ghgs --help`` waits for no library.
+The module that does the work of a verb is imported when the verb runs, so that ``ghgs --help`` imports
+no heavy library.
 """
 
 from typing import Annotated, ClassVar, Literal
@@ -16,26 +16,24 @@ Axis = Literal["y", "-y", "z"]
 
 
 class OfPhotographs(Verb):
-    """The user's photographs and their cameras."""
+    """Keys of verbs that read a user's photographs and cameras."""
 
-    reads_at_once: ClassVar[bool] = False  #: whether photographs are decoded beside the imports
+    reads_at_once: ClassVar[bool] = False  #: whether photographs are decoded during the imports
     images: PathText | None = None
-    """Folder of photographs or videos named after their cameras;
-    of such folders: one for each instant."""
+    """Folder of photographs or videos named after their cameras, or of one such folder for each instant."""
     cameras: PathText | None = None
-    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap,
-    TOML of Pose2Sim."""
+    """Calibration, a file or folder: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of
+    Pose2Sim, .qca.txt of Qualisys."""
     masks: PathText | None = None
-    """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration,
-    or alpha."""
+    """Folder of masks. null: the first available source of backgrounds, segment, <name>_mask.png, masks
+    that the calibration names, alpha."""
     backgrounds: PathText | None = None
-    """Folder of photographs without the subject."""
+    """Folder of photographs without the subject, named after their cameras."""
     segment: Text | None = None
-    """rembg: masks by that package."""
+    """rembg: compute masks with that package."""
 
     def require_files(self) -> None:
-        """As of every verb; photographs that are read at once are then decoded beside
-        the imports."""
+        """Check the files, and with ``reads_at_once`` start decoding photographs in the background."""
         super().require_files()
         if self.reads_at_once and self.images is not None and self.cameras is not None:
             from ghgs_capture.verbs.photographs import begin_to_read
@@ -54,44 +52,43 @@ class Predict(OfPhotographs, Measured):
     has_trained_data = True
 
     checkpoint: PathText | None = "shipped"
-    """The one that comes with the package, or a file of ``ghgs train`` or ``ghgs import``."""
+    """shipped: the weights of this package; else a file of ``ghgs train`` or ``ghgs import``."""
     check_cameras: bool = True
-    """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
+    """Reject cameras that the masks contradict (``ghgs doctor task=cameras`` prints details)."""
     size: CropSize | None = None
-    """Side or [height, width] of what the model sees, in pixels; null: as it was trained. At most
+    """Side or [height, width] of the model's input in pixels; null: the size of its training. At most
     2072, four times the published 518: memory grows with its square."""
     refine_masks: Literal["auto"] | Annotated[int, Field(ge=0, le=64)] = "auto"
-    """Pixels of size that masks may be off by: photographs say where outlines are; 0: none; auto: 4
-    where photographs contradict the masks (of images alone, not of a data set)."""
+    """Correct outlines of masks by up to this many pixels of the model's input; 0: none; auto: 4 if the
+    photographs contradict the masks (with images only, not for a data set)."""
     refine_cameras: Literal["auto"] | Annotated[int, Field(ge=0, le=100)] = "auto"
-    """Rounds, at most, that correct the cameras until the photographs agree; 0: none; auto: 4 where
-    silhouettes contradict the cameras (of images alone, not of a data set)."""
+    """Maximum number of rounds that correct the cameras until the photographs agree; 0: none; auto: 4 if
+    silhouettes contradict the cameras (with images only, not for a data set)."""
     refine_tones: Literal["auto", 0] = "auto"
-    """auto: undo the tone curve that a single camera has beside the others (of images alone);
-    0: leave it."""
+    """auto: undo the tone curve of a camera that differs from the others (with images only); 0: keep it."""
     refine: int = Field(0, ge=0, le=10000)
-    """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
+    """Optimisation steps towards the photographs after the prediction, such as 15; 0: none."""
     out: PathText | None = None
-    """Folder for the results; null: that of this run."""
+    """Folder for the results; null: the run's directory."""
     subject: Text = "0"
-    """Without images: name of the subject, or its number in the split."""
+    """Without images: name of the subject, or its index in the split."""
     split: Literal["train", "val"] = "val"
-    """Without images: where the subject is."""
+    """Without images: split of the subject."""
     formats: Texts = ("ply", "html", "turntable", "depth", "inputs")
-    """What is written: ply, html, turntable, depth, inputs; with the extra formats:
-    compressed_ply, spz, sog; with the extra video: mp4; or all."""
+    """Formats to write: ply, html, turntable, depth, inputs; with the extra "formats" compressed_ply, spz,
+    sog; with the extra "video" mp4; or all."""
     up: Axis | None = None
-    """Axis that points up in all files, such as -y for SuperSplat; null: that of the cameras' world."""
+    """Axis that points up in all files, such as -y for SuperSplat; null: the world of the cameras."""
     smooth: bool = False
-    """Gaussians in files are as large as the photographs' pixels: no gaps on larger screens."""
+    """Widen Gaussians in files to the photographs' pixels, which avoids gaps on larger screens."""
     turntable: Turntable = Turntable()
-    """Pictures around the subject."""
+    """Images rendered around the subject."""
     sequence: SequenceOptions = SequenceOptions()
-    """Which instants count, and how the videos of cameras fit together."""
+    """Instants to use, and how the videos of cameras are synchronised."""
 
 
 class View(Predict):
-    """A page in the browser to look around in a prediction."""
+    """Show a prediction in the browser."""
 
     work = "ghgs_capture.verbs.view.run"
     example = "ghgs view path=runs/predict/..."
@@ -100,45 +97,43 @@ class View(Predict):
     reads_at_once = False
 
     path: PathText | None = None
-    """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY;
-    null: predict first."""
+    """Directory of ``ghgs predict`` (with its formats ply and inputs), or a PLY; null: predict first."""
     checkpoint: PathText | None = None
-    """Without path: a checkpoint, as for ``ghgs predict``;
-    null: the one that comes with the package."""
+    """Without path: a checkpoint, as for ``ghgs predict``; null: the weights of this package."""
     formats: Texts = ("ply", "inputs")
-    """What is written, as for ``ghgs predict``."""
+    """Formats to write, as for ``ghgs predict``."""
     host: Text = "127.0.0.1"
-    """Address to listen at: this machine only; 0.0.0.0 opens the page to the network."""
+    """Address of the server; 127.0.0.1: for this machine only; 0.0.0.0: for the network."""
     port: int = Field(8080, ge=0, le=65535)
-    """The next free one is taken where it is in use."""
+    """Port of the server; the next free one if it is in use."""
     seconds: Positive | None = None
-    """The page is closed after so long; null: never."""
+    """Time in seconds after which the server stops; null: never."""
 
 
 class Adapt(OfPhotographs, Training):
-    """Train the weights of the package further on the instants of your capture, in minutes."""
+    """Fine-tune weights on the instants of your capture, in minutes."""
 
     work = "ghgs_capture.verbs.adapt.run"
     example = "ghgs adapt cameras=cameras.json images=photographs masks=masks out=mine.ckpt"
     opens = ("checkpoint",)
 
     checkpoint: PathText = "shipped"
-    """The weights to start from."""
+    """Initial weights, as for ``ghgs predict``."""
     minutes: float = Field(3, gt=0, le=1440)
-    """Minutes of training."""
+    """Duration of the training in minutes."""
     out: PathText | None = None
     """File for the weights; null: adapted.ckpt in the run's directory."""
 
 
 class Doctor(OfPhotographs):
-    """Whether cameras and masks fit together, and what this machine lacks."""
+    """Check whether cameras and masks fit together, and what this machine lacks."""
 
     work = "ghgs_capture.verbs.doctor.run"
     example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"
     reads_at_once = True
 
     task: Literal["cameras", "machine"] = "cameras"
-    """cameras: whether photographs, masks and calibration fit together, and what would fit.
-    machine: what there is, and what is missing for which feature."""
+    """cameras: check photographs, masks and calibration, and find the convention that fits.
+    machine: list hardware and packages, and features for which something is missing."""
     device: Device = "auto"
-    """Of task=machine."""
+    """Device of task=machine."""

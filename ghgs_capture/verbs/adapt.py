@@ -1,4 +1,4 @@
-"""``ghgs adapt``: weights for one capture, from its own instants."""
+"""``ghgs adapt``: fine-tune weights on the instants of one capture."""
 
 import json
 from pathlib import Path
@@ -33,13 +33,13 @@ from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.weights.checkpoint import write_inference
 from ghgs_lit.weights.reading import file_of
 
-_INSTANTS = 60  #: Instants, spread over a sequence, that are read to learn from
-#: Weights of the loss's terms for instants, of which depth and body are not known.
+_INSTANTS = 60  #: Maximum number of instants, spread over a sequence, to train on
+#: Loss weights for instants, which have no reference depth and body.
 _WEIGHTS = {"chamfer": 0.0, "depth": 0.0, "silhouette": 0.2}
 
 
 class Started(Adapt):
-    """A training from the weights of ``checkpoint``, with the keys of ``ghgs train`` that it needs."""
+    """``Adapt`` with the keys of ``ghgs train`` that start a training from existing weights."""
 
     init_from: PathText
     init_strict: bool
@@ -50,12 +50,9 @@ class Started(Adapt):
 def run(verb: Adapt) -> float | str | None:
     """Run the verb; Ctrl-C or SIGTERM interrupts it.
 
-    Args:
-        verb: the run.
-
     Returns:
-        Mean PSNR in dB of instants that were not learned from, also of a run that is done; ``BUSY``
-        (:mod:`ghgs_lit.runs.job`): in a sweep, another process works on it.
+        Mean PSNR in dB of the held-out instants, also if the run was already complete; ``BUSY``
+        (:mod:`ghgs_lit.runs.job`) if another process of a sweep works on it.
     """
     verb = verb.replace(**model_of(verb.checkpoint, verb))
     files_to_write(verb, ["out"])
@@ -64,17 +61,15 @@ def run(verb: Adapt) -> float | str | None:
 
 
 def with_instants(run: Adapt, directory: Path) -> Adapt:
-    """Configure the training for the instants of ``images``.
+    """Configure the training for the instants of ``images``: one camera is the target, the others are
+    the inputs.
 
     Args:
         run: as configured.
-        directory: of the run, where instants are kept.
-
-    Returns:
-        The run: of all cameras but one, the inputs, that one is the target.
+        directory: of the run; instants are written to its folder ``instants``.
 
     Raises:
-        InputError: there is one instant, or fewer than three cameras, or more than eight.
+        InputError: there is only one instant, or fewer than three cameras, or more than eight.
     """
     folder = capture_folder(run)
     require(len(folder.instants) > 1, "images", "folders of two instants or more", len(folder.instants))
@@ -95,12 +90,12 @@ def with_instants(run: Adapt, directory: Path) -> Adapt:
 
 
 def prepare_instants(run: Adapt) -> None:
-    """Write the instants that are learned from, with the masks, cameras and gains of a prediction.
+    """Write the instants to train on, with the masks, cameras and gains that a prediction would use.
 
-    Those that an interrupted run has written are kept.
+    Does nothing if an interrupted run has already written them.
 
     Args:
-        run: of :func:`with_instants`.
+        run: from :func:`with_instants`.
 
     Raises:
         InputError: fewer than two instants have masks that agree.
@@ -133,12 +128,12 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     """Prepare the instants, train and write the weights.
 
     Args:
-        run: of :func:`with_instants`.
-        directory: of the run; the weights go there unless ``out`` is given.
-        stats: gets the facts of the training, as for :func:`ghgs_lit.cli.train.train`.
+        run: from :func:`with_instants`.
+        directory: of the run; the weights are written there unless ``out`` is given.
+        stats: receives statistics of the training, as for :func:`ghgs_lit.cli.train.train`.
 
     Returns:
-        Mean PSNR in dB of instants that were not learned from, after training; None: it was interrupted.
+        Mean PSNR in dB of the held-out instants after training; None if it was interrupted.
     """
     prepare_instants(run)
     data = build_data(run)
@@ -148,7 +143,7 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     place = directory / "before"
     path = measure_and_write({"model": method}, data, run, place, device, verb="adapt", choices=choices())
     before = read_results(path)["summary"][0]["psnr"]
-    del method  # the training needs its memory
+    del method  # frees memory for the training
     # Stages are frozen at first only where training starts from random weights.
     seconds = 60 * run.plain["minutes"]
     limited = run.changed(trainer={"max_time": {"seconds": seconds}}, optimizer={"freeze_until": {}})

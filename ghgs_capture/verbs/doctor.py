@@ -1,4 +1,4 @@
-"""``ghgs doctor``: diagnose cameras or this machine; one function for each task."""
+"""``ghgs doctor``: diagnose cameras or this machine, with one function for each task."""
 
 from typing import TYPE_CHECKING
 
@@ -20,11 +20,8 @@ if TYPE_CHECKING:
 def run(verb: "Doctor") -> None:
     """Run the task of the verb.
 
-    Args:
-        verb: the run.
-
     Raises:
-        InputError: as for the task.
+        InputError: from the task.
     """
     tasks = {"cameras": cameras, "machine": machine}
     tasks[verb.task](verb)
@@ -32,9 +29,6 @@ def run(verb: "Doctor") -> None:
 
 def cameras(run: "Doctor") -> None:
     """Check whether photographs, masks and calibration fit together.
-
-    Args:
-        run: as configured.
 
     Raises:
         InputError: the cameras do not fit the masks, or a file is missing or wrong.
@@ -50,11 +44,7 @@ def cameras(run: "Doctor") -> None:
 
 
 def machine(run: "Doctor") -> None:
-    """Print what this machine has and which features lack a package or device.
-
-    Args:
-        run: names the device.
-    """
+    """Print what this machine has, for ``run.device``, and which features lack a package or device."""
     console = Console(soft_wrap=True)
     for title, lines in (
         ("This machine", machine_lines(pick_device(run.device))),

@@ -1,5 +1,4 @@
-"""Folder of photographs that a configuration names,
-and the check of its cameras before a verb runs."""
+"""Open the folder of photographs of a configuration, and check its cameras before a verb runs."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,7 @@ from ghgs_lit.errors import InputError, require
 if TYPE_CHECKING:
     from ghgs_capture.verbs import OfPhotographs
 
-#: The folder whose photographs are being decoded, if any, and what was said of it
+#: At most one folder whose photographs are being decoded, with its :func:`sources_of`
 _BEGUN: list[tuple[dict[str, Any], CaptureFolder]] = []
 
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "sequence")
@@ -18,16 +17,13 @@ _CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
 
 
 def sources_of(run: "OfPhotographs") -> dict[str, Any]:
-    """What a run says of photographs.
+    """Arguments of :class:`ghgs_capture.folder.CaptureFolder` from a run's keys.
 
     Args:
-        run: its groups need not be checked yet.
-
-    Returns:
-        ``images``, ``cameras`` and the keys beside them.
+        run: its groups may be unchecked.
 
     Raises:
-        InputError: one of the two is missing.
+        InputError: ``images`` or ``cameras`` is missing.
     """
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(getattr(run, name) is not None, name, example, None)
@@ -38,13 +34,7 @@ def sources_of(run: "OfPhotographs") -> dict[str, Any]:
 
 
 def capture_folder(run: "OfPhotographs") -> CaptureFolder:
-    """The folder that :func:`sources_of` describes, with what :func:`begin_to_read` decodes.
-
-    Args:
-        run: as for :func:`sources_of`.
-
-    Returns:
-        The folder.
+    """Open a run's folder of photographs, reusing the one that :func:`begin_to_read` decodes.
 
     Raises:
         InputError: a key or file is missing or wrong.
@@ -56,10 +46,12 @@ def capture_folder(run: "OfPhotographs") -> CaptureFolder:
 
 
 def begin_to_read(run: "OfPhotographs") -> None:
-    """Start decoding the first instant for the next :func:`capture_folder`.
+    """Start decoding the first instant in the background, for the next :func:`capture_folder`.
+
+    With ``segment`` nothing is decoded ahead.
 
     Args:
-        run: as for :func:`sources_of`.
+        run: its groups may be unchecked.
 
     Raises:
         InputError: as for :func:`capture_folder`.
@@ -72,13 +64,10 @@ def begin_to_read(run: "OfPhotographs") -> None:
 
 
 def check_cameras(folder: CaptureFolder) -> None:
-    """Print how well cameras and masks agree in a few instants.
-
-    Args:
-        folder: of one instant or several.
+    """Print how well cameras and masks agree in up to ``_CHECKED`` instants.
 
     Raises:
-        InputError: they contradict each other in all of these, or the only instant cannot be read.
+        InputError: cameras and masks disagree in all of these, or the only instant cannot be read.
     """
     from ghgs_capture.camera_report import diagnose, find_parted_masks
     from ghgs_capture.rig import spread

@@ -1,4 +1,4 @@
-"""``ghgs predict``: turn photographs into a splat and the other files that ``formats`` lists."""
+"""``ghgs predict``: turn photographs into a splat and the other files of ``formats``."""
 
 import contextlib
 import time
@@ -28,20 +28,16 @@ from ghgs_lit.parsing import read_json
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.weights.checkpoint import read_config
 
-if TYPE_CHECKING:  # it would import Lightning, which takes seconds
+if TYPE_CHECKING:  # importing Lightning takes seconds
     from ghgs_capture.verbs import Predict
 
-#: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
+#: PSNR in dB, in the subject's box, below which the rendering of an input view is poor.
 LOW_PSNR = 25.0
 
 
 @torch.no_grad()
 def run(verb: "Predict") -> None:
-    """Run the verb.
-
-    Args:
-        verb: the run.
-    """
+    """Predict the user's photographs, or a subject of a data set, and write the files."""
     directory = output_dir() if verb.out is None else resolved(verb.out)
     is_capture = verb.images is not None or verb.cameras is not None
     verb = verb if is_capture else inputs.with_trained_data(verb)
@@ -54,11 +50,11 @@ def predict_subject(run: "Predict", directory: Path) -> None:
     """Predict a subject of a data set and write its files.
 
     Args:
-        run: with the checkpoint's model.
+        run: with the checkpoint's model options.
         directory: where files are written.
 
     Raises:
-        InputError: there is no such subject, or an option does not fit.
+        InputError: there is no such subject, or an option does not apply to data sets.
     """
     expected = "0 without images=...: photographs of data sets are on black"
     require(run.refine_masks in (0, "auto"), "refine_masks", expected, run.refine_masks)
@@ -84,10 +80,10 @@ def predict_subject(run: "Predict", directory: Path) -> None:
 def predict_photographs(run: "Predict", directory: Path) -> None:
     """Predict each instant of a folder of photographs and write its files.
 
-    Several instants get a folder each and shared files.
+    If there are several instants, each gets a folder, next to files that cover all of them.
 
     Args:
-        run: with the checkpoint's model.
+        run: with the checkpoint's model options.
         directory: where files are written.
 
     Raises:
@@ -139,7 +135,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
 
 
 def _warn_of(directory: Path) -> None:
-    """Print what a prediction's report tells of tone curves, and of inputs that do not come back."""
+    """Print the tone curves in a prediction's report, and whether input views are rendered poorly."""
     report = read_json(directory / REPORT)
     for name, gamma in report.get("tones", {}).items():
         print(
@@ -157,28 +153,17 @@ def _warn_of(directory: Path) -> None:
 
 
 def _moved_line(moved: Mapping[str, float]) -> str:
-    """The message about corrected cameras: pixels by which the subject moved in each photograph."""
+    """Message about corrected cameras: pixels by which the subject moved in each photograph."""
     return f"refine_cameras: moved by {', '.join(f'{name} {p:.2f}' for name, p in moved.items())} pixels"
 
 
 def _free_places(
     folder: CaptureFolder, output: export.OutputOptions, directory: Path, moves_cameras: bool
 ) -> tuple[dict[str, Path], export.Instants | None]:
-    """Where the files of each instant go, and of all together.
+    """Directory of each instant by name, and the files that cover several instants (None for one).
 
-    Args:
-        folder: of the photographs.
-        output: which files are written.
-        directory: of a single instant; several get a folder each in it.
-        moves_cameras: several instants also share a file of corrected cameras.
-
-    Returns:
-        The directory of each instant by name, and what several of them share;
-        None for a single one.
-
-    Raises:
-        InputError: a file would be written over that is read.
-    """
+    ``moves_cameras`` adds a file of corrected cameras to the latter. Raises InputError if writing would
+    replace an input or a file that no prediction wrote."""
     several = len(folder.instants) > 1
     read = folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
@@ -198,7 +183,7 @@ def shared_by(
     refining: Mapping[str, Any],
     renderer: Renderer,
 ) -> tuple[Mapping[str, float], Backgrounds, Rig | None, bytes]:
-    """Estimate what the instants of a sequence share, from a few of them.
+    """Estimate tone curves, static backgrounds and corrected cameras of a sequence from some instants.
 
     Args:
         folder: of several instants.
@@ -206,11 +191,11 @@ def shared_by(
         size: (height, width) of the crops in pixels.
         refining: ``refine_cameras``, ``refine_masks`` and ``tones`` as for
             :func:`ghgs_capture.prediction.predict`.
-        renderer: what refining draws with.
+        renderer: renders the comparisons of the refinement.
 
     Returns:
-        Gammas of tone curves (those of the first instant), static backgrounds, corrected cameras,
-        and the content of the cameras' file. None and no content: the cameras stay as they are.
+        Gammas by camera (from the first instant), backgrounds, corrected cameras, and the content of
+        their file; the last two are None and empty if the cameras remain unchanged.
     """
     begin = time.perf_counter()
     names = folder.instants
@@ -239,14 +224,11 @@ def shared_by(
 
 
 def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
-    """Correct masks by static backgrounds; prints which ones changed.
+    """Correct masks by static backgrounds and print which ones changed.
 
     Args:
-        backgrounds: by camera; of none nothing changes.
+        backgrounds: without any, nothing changes.
         given: an instant.
-
-    Returns:
-        The instant with corrected masks.
     """
     capture = backgrounds.applied(given)
     both = zip(given.photographs, capture.photographs, strict=True)
@@ -257,16 +239,13 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
 
 
 def captures_of(folder: CaptureFolder, names: Sequence[str] | None = None) -> Iterator[Capture]:
-    """Read instants of a folder one by one; the next one is decoded meanwhile.
+    """Read instants of a folder one by one, decoding the next one in the background.
 
-    Of several instants, those that cannot be read are left out with a message.
+    If there are several, those that cannot be read are left out with a message.
 
     Args:
         folder: of one instant or several.
         names: of the instants; None: all.
-
-    Yields:
-        The capture of each instant.
 
     Raises:
         InputError: the only instant cannot be read.
@@ -300,14 +279,14 @@ def write_result(
     checkpoint: str,
     options: export.OutputOptions,
 ) -> None:
-    """Write the files of a result and print what was done.
+    """Write the files of a prediction and print which corrections were made.
 
     Args:
         directory: where files are written.
-        result: the prediction of one subject.
-        renderer: draws pictures of the files.
+        result: of one subject.
+        renderer: renders the images in the files.
         checkpoint: name of the weights, for the report.
-        options: formats and choices for them.
+        options: formats and their options.
     """
     facts: dict[str, Any] = {"checkpoint": checkpoint, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}

@@ -1,5 +1,6 @@
-"""``ghgs view``: a page in the browser (the extra ``viewer``) to look around in a prediction or a PLY:
-a viser server with the Gaussians, cameras and hull, and a switch for each."""
+"""``ghgs view``: look around in a prediction or a PLY in the browser (the extra ``viewer``).
+
+A viser server shows the Gaussians, cameras and visual hull, each with a checkbox."""
 
 import contextlib
 import logging
@@ -42,8 +43,7 @@ _HULL_POINTS = 50_000
 
 @dataclass(frozen=True)
 class Content:
-    """Gaussians of one subject; ``batch`` has its photographs,
-    masks and cameras where they are known."""
+    """Gaussians of one subject, with its photographs, masks and cameras where they are known."""
 
     gaussians: Gaussians
     up: Float[Tensor, "3"]
@@ -51,36 +51,32 @@ class Content:
 
     @property
     def cameras(self) -> Cameras:
-        """The cameras [V] of the photographs."""
+        """Cameras [V] of the photographs."""
         return self.batch.cameras[0]
 
     @cached_property
     def center(self) -> Float[Tensor, "3"]:
-        """The middle of the subject."""
+        """Centre of the subject."""
         return center_of(subject_points(self.gaussians), self.cameras)
 
     @cached_property
     def hull(self) -> np.ndarray:
-        """Points [n, 3] of the visual hull: where the rays of the subject's pixels enter it."""
+        """Points [n, 3] where the rays of the subject's pixels enter the visual hull, at most
+        ``_HULL_POINTS``."""
         near = VisualHull(dilation=0.0)(self.batch).near
         points = unproject_maps(near, self.batch.cameras)[self.batch.masks]
         return points[:: -(-max(len(points), 1) // _HULL_POINTS)].numpy()
 
 
 def read_content(path: str | Path, up: str | None) -> Content:
-    """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``),
-    or a PLY.
+    """Read a PLY, or a directory of ``ghgs predict`` with its formats ``ply`` and ``inputs``.
 
     Args:
         path: the directory or the PLY.
-        up: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y``
-            for a PLY.
-
-    Returns:
-        The Gaussians, and of a directory the photographs with their cameras.
+        up: the upward axis ``y``, ``-y`` or ``z``; None: estimated from the cameras, ``y`` for a PLY.
 
     Raises:
-        InputError: ``path`` is neither, or a file of it is missing or wrong.
+        InputError: ``path`` is neither, or a file in it is missing or wrong.
     """
     path = Path(path)
     choice("up", up, (None, *AXES))
@@ -96,8 +92,8 @@ def read_content(path: str | Path, up: str | None) -> Content:
 
 
 def _read_inputs(directory: Path) -> Batch:
-    """Photographs, masks and cameras of the format ``inputs``.
-    InputError: one is missing or wrong."""
+    """Read photographs, masks and cameras of the format ``inputs``; raises InputError if one is missing or
+    wrong."""
     stored = read_matrices(directory / "cameras.json")
     pictures = []
     cameras = []
@@ -125,7 +121,7 @@ def _read_inputs(directory: Path) -> Batch:
 
 
 def _require_address(host: str) -> None:
-    """Refuse an address that is not this machine's: viser would wait for it silently."""
+    """Reject an address that is not this machine's: viser would wait for it silently."""
     try:
         family, *_ = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
         socket.create_server((host, 0), family=family).close()
@@ -134,7 +130,7 @@ def _require_address(host: str) -> None:
 
 
 def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any:
-    """Answer 403 to a page whose origin is not the address that it connects to; None: accepted."""
+    """Respond with 403 to a page whose origin is not the address that it connects to, else None."""
     origin = request.headers.get("Origin")
     if response.status_code != 101 or origin is None or origin.split("://")[-1] == request.headers["Host"]:
         return None
@@ -143,13 +139,12 @@ def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Make servers that start in this context refuse pages of other sites;
-    viser accepts any origin."""
+    """Make servers that start in this context reject pages of other sites; viser accepts any origin."""
     from websockets.asyncio import server
 
     serve = server.serve
     names = "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
-    # A server open to the network has many names; the Host header has the one in use.
+    # A server open to the network has many names; the Host header contains the one in use.
     names = ".+" if host in ("0.0.0.0", "::") else names
     origins = [None, re.compile(rf"https?://({names})(:\d+)?")]
     server.serve = partial(serve, origins=origins, process_response=_refuse_other_addresses)
@@ -160,12 +155,12 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 class Viewer:
-    """A running page.
+    """A viser server that shows one subject.
 
     Args:
-        content: what it shows.
-        host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
-        port: the first one to try.
+        content: the subject.
+        host: address to listen on; ``127.0.0.1`` is reachable from this machine only.
+        port: the first port to try.
 
     Raises:
         InputError: viser is not installed, or this machine has no such address.
@@ -175,7 +170,7 @@ class Viewer:
         viser = installed("viser", "viewer", "ghgs view")
         _require_address(host)
         self.content = content
-        logging.getLogger("websockets").setLevel(logging.WARNING)  # else a line for each visitor
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # no line for each visitor
         with _own_pages_only(host):
             self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
         self.server.scene.set_up_direction(content.up.numpy())
@@ -187,16 +182,16 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Where browsers find the page."""
+        """URL of the page."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def stop(self) -> None:
-        """Close the page."""
+        """Stop the server."""
         self.server.stop()
 
     def _add_splats(self) -> None:
-        """Add the Gaussians; those of a prediction as large as the photographs' pixels, else a larger
-        screen shows gaps."""
+        """Add the Gaussians, those of a prediction widened to the photographs' pixels so that larger
+        screens show no gaps."""
         g = self.content.gaussians
         if self.content.batch is not None:
             g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
@@ -206,7 +201,7 @@ class Viewer:
         self._switch("Gaussians", self.server.scene.add_gaussian_splats("/gaussians", *drawn))
 
     def _add_hull(self) -> None:
-        """Add the points of the visual hull, which are hidden at first."""
+        """Add the points of the visual hull, initially hidden."""
         points = self.content.hull
         size = float(np.ptp(points, axis=0).max(initial=0.0)) / 400
         blue = np.array([90, 160, 255], np.uint8)
@@ -223,12 +218,12 @@ class Viewer:
             node.visible = box.value
 
     def _show_frustums(self) -> None:
-        """Show the cameras but that of the visitors, whose photograph would hide the subject."""
+        """Show all cameras except the visitors', whose photograph would hide the subject."""
         for view, frustum in enumerate(self._frustums):
             frustum.visible = self.cameras.value and view != self._at
 
     def _add_cameras(self) -> None:
-        """Add the cameras with their photographs; a click puts the visitors there."""
+        """Add the cameras with their photographs; a click on one moves the visitors there."""
         from viser.transforms import SO3
 
         cameras = self.content.cameras
@@ -257,11 +252,11 @@ class Viewer:
             self._poses.append((pose, fov))
         self.cameras = self.server.gui.add_checkbox("cameras", True)
         self.cameras.on_update(lambda _: self._show_frustums())
-        self._at: int | None = None  # the camera that visitors were put at
+        self._at: int | None = None  # index of the camera that visitors were moved to
 
     def _place_visitors(self) -> None:
-        """Start visitors behind and beside the first camera:
-        its photograph would hide the subject."""
+        """Start visitors behind the first camera and to its side, so that its photograph does not hide the
+        subject."""
         cameras = self.content.cameras
         target = self.content.center.numpy()
         up = self.content.up.numpy().astype(np.float64)
@@ -273,7 +268,7 @@ class Viewer:
         start.fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[0, 1, 1]))
 
     def go_to(self, view: int) -> None:
-        """Put every visitor at the camera of a photograph.
+        """Move all visitors to the camera of a photograph.
 
         Args:
             view: index of the photograph.
@@ -289,10 +284,7 @@ class Viewer:
 
 
 def run(verb: "View") -> None:
-    """Show ``path``; without it predict first. Ctrl-C ends it.
-
-    Args:
-        verb: the run.
+    """Show ``path``, or predict first without it, until Ctrl-C.
 
     Raises:
         InputError: there is nothing to show, or a file or option is wrong.
@@ -306,7 +298,7 @@ def run(verb: "View") -> None:
         predict.run(verb)
     else:
         write_config(verb, output_dir())
-    # A new prediction is already in the frame of ``up``, and its cameras tell which axis that is.
+    # A new prediction is already in the frame of ``up``, and its cameras define the axis.
     content = read_content(verb.path or output_dir(), verb.up if verb.path else None)
     viewer = Viewer(content, verb.host, verb.port)
     print(f"viewer: {viewer.address}; Ctrl-C ends it", flush=True)
