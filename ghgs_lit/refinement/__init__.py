@@ -1,4 +1,4 @@
-"""Refinement of a prediction by seconds of optimisation through the rasterizer."""
+"""Refinement of a prediction, or of cameras, by a few seconds of optimisation through the rasterizer."""
 
 from ghgs_lit.refinement.cameras import CameraRefinement, pixels_moved
 from ghgs_lit.refinement.refinement import Change, Descent, Refinement, Report

@@ -1,11 +1,11 @@
-"""Correction of a capture's cameras until its photographs agree.
+"""Correction of a capture's cameras until its input images agree.
 
-First, cameras move and zoom until silhouettes are consistent
-(:mod:`ghgs_lit.refinement.coherence`); they stay where a prediction does not confirm the gain, as
-with wrong masks. Then the Gaussians of the other views are rendered with each view's camera, which
-moves until the render fits the photograph (bundle adjustment as in BARF, Lin et al., ICCV 2021).
-Photographs do not tell where the whole rig is: only relative motions of cameras are estimated
-(:mod:`ghgs_lit.geometry.rotations`)."""
+First, poses and focal lengths are optimised until silhouettes are consistent
+(:mod:`ghgs_lit.refinement.coherence`); the result is discarded where a prediction does not confirm
+the gain, as with wrong masks. Then the Gaussians of the other views are rendered with each view's
+camera, whose pose is optimised until the render matches the image (bundle adjustment as in BARF, Lin
+et al., ICCV 2021). The pose of the rig as a whole is not observable: only relative motions of cameras
+are estimated (:mod:`ghgs_lit.geometry.rotations`)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,25 +24,24 @@ from ghgs_lit.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]
-#: Numbers of the elements of a batch.
+#: One number per element of a batch.
 Numbers = Float[Tensor, " B"]
-#: A choice of their cameras.
+#: A selection of cameras.
 Which = Bool[Tensor, "B V"]
 
 _STEPS = 15  #: Steps of the optimiser in a round
-_RATE = 0.006  #: Their size at first: radians, and half heights of the subject
+_RATE = 0.006  #: Initial learning rate: radians, and half heights of the subject
 _OUTLINE = 0.5  #: Weight of silhouettes; that of colours is 1
 _SAME = 0.05  #: Largest difference in metres of depths of one surface
 _STAY = 4.0  #: Weight of the squared motion
-#: Relative decrease of the loss for which the cameras of the first round, and cameras that
-#: silhouettes propose, are kept: with exact cameras it is up to 0.01 (0.02 from above), with
-#: cameras off by a pixel 0.02 to 0.2.
+#: Relative decrease of the loss required to accept the cameras of the first round, and those from
+#: silhouettes: exact cameras reach up to 0.01 (0.02 from above), cameras off by a pixel 0.02 to 0.2.
 _FIRST = 0.02
 #: The same for the cameras of a later round.
 _LATER = 0.01
-#: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance
-#: below ``_EXACT`` pixels means that they are off by half a pixel at most: the first round
-#: must gain ``_DOUBTED``.
+#: With ``_TELLING`` cameras or more (fewer silhouettes constrain them less), a silhouette distance
+#: below ``_EXACT`` pixels implies errors of at most half a pixel: the first round must gain
+#: ``_DOUBTED``.
 _TELLING = 4
 _EXACT = 1.5e-4
 _DOUBTED = 0.05
@@ -50,8 +49,8 @@ _DOUBTED = 0.05
 
 @dataclass(frozen=True)
 class _Views:
-    """The ``n`` views of a batch with the Gaussians that the element's other views predict;
-    ``owner``: the view that each of these Gaussians is drawn in."""
+    """The ``n`` views of a batch, each with the Gaussians predicted from its element's other views;
+    ``owner``: the view that each of these Gaussians is rendered in."""
 
     gaussians: Gaussians
     owner: Int[Tensor, " N"]
@@ -62,15 +61,14 @@ class _Views:
 
 
 class CameraRefinement:
-    """``refinement(batch)``: the batch with cameras that agree better.
+    """Optimise the cameras of a batch: ``refinement(batch) -> Batch``.
 
     Args:
-        rounds: most rounds of prediction and correction, 1 or more. An element keeps its cameras
-            from the first round on that does not make its photographs agree better.
-        predict: gives the prediction of a batch, as a model does.
-        renderer: draws Gaussians, with gradients.
-        shared: the elements of a batch are instants of one rig,
-            whose cameras move alike in all of them.
+        rounds: largest number of rounds of prediction and correction, 1 or more. The cameras of an
+            element stay from the first round on that does not improve the agreement of its images.
+        predict: predicts from a batch, as a model does.
+        renderer: renders Gaussians, with gradients.
+        shared: the elements of a batch are instants of one rig, with common motions of its cameras.
 
     Raises:
         InputError: ``rounds`` is below 1.
@@ -86,14 +84,8 @@ class CameraRefinement:
         self.shared = shared
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with corrected cameras; targets stay as they are.
-
-        Args:
-            batch: with two views or more.
-
-        Returns:
-            The batch; cameras of elements that do not agree better are those given.
-        """
+        """Correct the input cameras of a batch of two or more views; targets are unchanged, and so are
+        the cameras of elements that do not improve."""
         frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
         inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
@@ -105,28 +97,28 @@ class CameraRefinement:
                 break
             inside = replace(inside, cameras=cameras)
             moved = moved | is_better
-        # to the frame and back is not exact
+        # A round trip through the frame is not exact: unmoved cameras are copied.
         left = frame.leave_cameras(inside.cameras, batch.cameras)
         return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()
     def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
-        """Cameras of consistent silhouettes, where a prediction confirms them.
+        """Make silhouettes consistent, where a prediction confirms the gain.
 
         Args:
             batch: in the subject's frame.
 
         Returns:
             The batch with these cameras; which elements they improve [B]; which cameras may be
-            wrong [B, V] (all, unless silhouettes and prediction agree on a few); what the first
-            round must gain [B].
+            wrong [B, V] (all, unless silhouettes and prediction agree on a few); the gain required
+            of the first round [B].
         """
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
         is_better = self._confirmed(batch, cameras)
         shared = ~is_better & ~free.all(1)
-        if bool(shared.any()):  # no camera that is wrong by itself, as it seemed
+        if bool(shared.any()):  # the few suspected cameras were not confirmed: move all of them
             together, _, _ = coherent_cameras(batch, self.shared, alone=False)
             cameras = _chosen(shared[:, None], together, cameras)
             free = free | shared[:, None]
@@ -136,8 +128,7 @@ class CameraRefinement:
         return replace(batch, cameras=cameras), is_better, free, first
 
     def _confirmed(self, batch: Batch, cameras: Cameras) -> Bool[Tensor, " B"]:
-        """Which elements' predictions agree better with other cameras;
-        false where these are the same."""
+        """Which elements' predictions agree better with ``cameras``; False where these are unchanged."""
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
             return moved
@@ -149,20 +140,11 @@ class CameraRefinement:
         return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
     def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
-        """L1 of colours and silhouettes per pixel of an element's subject,
-        or with ``shared`` its mean.
-
-        Args:
-            drawn: renders of the views.
-            views: what they are compared with.
-            batch: that the views are of.
-
-        Returns:
-            Losses [B].
-        """
+        """L1 of colours and silhouettes per pixel of each element's subject [B]; with ``shared``, the
+        mean over elements."""
         image = drawn.image[:, 0]
         alpha = drawn.alpha[:, 0, 0]
-        # Where the other views lack the surface of the photograph, what lies behind it is drawn.
+        # Where the other views do not see the surface, the render shows what lies behind it.
         same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
         errors = same * (image - views.photographs).abs().mean(1)
         errors = errors + _OUTLINE * (alpha - views.silhouettes).abs()
@@ -174,16 +156,16 @@ class CameraRefinement:
     def _corrected(
         self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
-        """Cameras after one round.
+        """Optimise the free cameras in one round.
 
         Args:
-            prediction: of the batch.
+            prediction: prediction of ``batch``.
             batch: in the subject's frame.
             free: which cameras may move.
-            worth: relative decrease of the loss that each element must exceed.
+            worth: relative decrease of the loss required of each element [B].
 
         Returns:
-            Cameras, and which elements gain that much [B]; the cameras of the others stay.
+            Cameras, unchanged for elements that gain less; and which elements gain that much [B].
         """
         cameras = batch.cameras
         losses = []
@@ -191,7 +173,7 @@ class CameraRefinement:
         axes = cameras.extrinsics[..., 2, :3]
         rigs = 1 if self.shared else len(axes)
         raw = torch.zeros(rigs, axes.shape[1], 6, dtype=axes.dtype, device=axes.device, requires_grad=True)
-        # Without an epsilon: gradients shrink with the size of the photographs.
+        # A negligible epsilon, because gradients shrink with the size of the images.
         optimizer = torch.optim.Adam([raw], lr=_RATE, betas=(0.8, 0.95), eps=1e-15)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
         for _ in range(_STEPS):
@@ -212,32 +194,14 @@ class CameraRefinement:
 
 
 def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
-    """Motions of the free cameras: without their common motion if all are free;
-    0 for fixed cameras.
-
-    Args:
-        motions: rotation vectors in radians and shifts in half heights [B, V, 6].
-        axes: optical axes of the cameras [B, V, 3].
-        free: which cameras may move.
-
-    Returns:
-        Motions [B, V, 6].
-    """
+    """Set motions of fixed cameras to 0; where all are free, remove the common motion."""
     all_are = free.all(1)[:, None, None]
     return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
 
 
 def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
-    """Cameras of one of two rigs.
-
-    Args:
-        which: cameras that are taken from the first, of a shape that broadcasts to [B, V].
-        first: cameras [B, V].
-        second: cameras [B, V] of the same photographs.
-
-    Returns:
-        Cameras [B, V].
-    """
+    """Take each camera from ``first`` where ``which`` (broadcast to [B, V]) is True, else from
+    ``second``."""
     which = which[..., None, None]
     lenses = torch.where(which, first.intrinsics, second.intrinsics)
     poses = torch.where(which, first.extrinsics, second.extrinsics)
@@ -245,14 +209,12 @@ def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
-    """How far a correction of cameras moves a box around the subject in each photograph.
+    """Root mean square motion, in pixels, of the corners of a box around the subject in each view
+    [B][V], caused by a correction of cameras.
 
     Args:
         before: the batch with the given cameras.
         after: the batch with the corrected ones.
-
-    Returns:
-        Root mean square motions of the corners in pixels, [B][V].
     """
     frame = Frame.of(before)
     corners = HEIGHT / 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], device=before.masks.device)] * 3)
@@ -268,7 +230,7 @@ def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
 
 
 def _views(prediction: Prediction, batch: Batch) -> _Views:
-    """Each view as an element of its own, with the Gaussians of its element's other views."""
+    """Make each view a separate element with the Gaussians of its element's other views."""
     b, v = batch.masks.shape[:2]
     gaussians = prediction.gaussians.detach()
     element = gaussians.image // v
@@ -286,7 +248,7 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
 
 
 def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
-    """The Gaussians of each view, moved in place of its camera; their orientations stay."""
+    """Move the Gaussians of each view instead of its camera; their orientations stay."""
     rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
     return replace(views.gaussians, means=means)

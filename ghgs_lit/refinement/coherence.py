@@ -1,9 +1,9 @@
-"""Correction of a capture's cameras by motions and zooms that make its silhouettes consistent.
+"""Correction of poses and focal lengths that makes a capture's silhouettes consistent.
 
-With right cameras, the ray of every silhouette pixel has a point inside all other silhouettes
+With correct cameras, the ray of every silhouette pixel has a point inside all other silhouettes
 (silhouette coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). With wrong
-ones, rays near the outlines have none: Gauss-Newton steps minimise how far outside the other
-silhouettes their best points lie. This needs no model and no surface that two photographs share."""
+ones, rays near the outlines have none: Gauss-Newton steps minimise the distance of their best points
+from the other silhouettes. This needs neither a model nor surfaces that are visible in two views."""
 
 import math
 from collections.abc import Sequence
@@ -25,36 +25,35 @@ from ghgs_lit.refinement.outlines import QUICK, TO, Lens, Outlines, Pose, best_p
 from ghgs_lit.types import Batch, Cameras
 
 Lenses = Float[Tensor, "K V 3 3"]  #: Intrinsics of ``K`` instants, whose crops differ
-Middles = Float[Tensor, "K 3"]  #: The subject's middle at ``K`` instants
-Which = Bool[Tensor, " V"]  #: A choice of cameras
+Middles = Float[Tensor, "K 3"]  #: Centre of the subject at ``K`` instants
+Which = Bool[Tensor, " V"]  #: A selection of cameras
 
 #: Mean distance of rays in pixels below which silhouettes are consistent.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, relative to the mean squared distance.
 _STAY = 1e-3
-#: Its factor for zooms: lenses are known better than poses.
+#: Factor of that weight for zooms: focal lengths are known better than poses.
 _KNOWN = 5.0
-#: Cameras are wrong by themselves if the others, as given, miss one another by less than
-#: ``_CLEARLY`` times what they do without any other ones (opposite cameras are nearly
-#: exchangeable), counted from ``_EXACT`` pixels, which exact cameras reach. They move alone if that
-#: leaves less than ``_COHERENT``, ``_AS_WELL`` times the distance that moving all leaves, or
+#: A set of cameras is suspected if, without it, the distance of the remaining given cameras is below
+#: ``_CLEARLY`` times the least distance without any other set (opposite cameras are nearly
+#: exchangeable); ``_EXACT`` pixels, which exact cameras reach, are added to both. The set moves alone
+#: if this leaves less than ``_COHERENT``, ``_AS_WELL`` times the distance after moving all, or
 #: ``_REST`` of the given distance, as with rough masks.
 _CLEARLY = 0.25
 _EXACT = 5e-5
 _AS_WELL = 1.5
 _REST = 0.02
-_BUMPED = 1e-3  #: Given distance from which it is tried: that of one camera off by a pixel
+_BUMPED = 1e-3  #: Given distance from which this is tried: that of one camera off by a pixel
 
 
 @dataclass(frozen=True)
 class _Phase:
-    """Gauss-Newton steps with one kind of distance,
-    for rays from pixels up to ``to`` inside their outline.
+    """Gauss-Newton steps with one kind of residual, for rays up to ``to`` pixels inside their outline.
 
     First, rays must meet the other silhouettes; the weight of those that miss them by r > ``scale``
     pixels falls with 1 / r. Then (``is_exact``) they must lie as deep in the others as in their
-    own, as outlines from the front and from behind do; beyond ``scale`` the weight vanishes (Geman
-    and McClure)."""
+    own silhouette, as outlines from the front and from behind do; beyond ``scale`` the weight
+    vanishes (Geman and McClure)."""
 
     steps: int
     to: float
@@ -96,17 +95,17 @@ class _Alignment:
 
 @torch.no_grad()
 def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V"]]:
-    """How far rays near outlines miss other silhouettes; a quick check.
+    """Quick check of cameras: mean distance by which rays near outlines miss other silhouettes.
 
-    With exact cameras the distance of all views is up to 0.0025, with ones off by 1.5 pixels 0.007
-    to 0.09; where one is off, the others' is that of exact cameras.
+    With exact cameras the distance over all views is up to 0.0025 pixels, with cameras off by 1.5
+    pixels 0.007 to 0.09; if one camera is off, that of the others is as for exact cameras.
 
     Args:
         batch: as for :func:`coherent_cameras`.
 
     Returns:
-        Mean distances in pixels: of all views [B], and of the others without each [B, V] (0 for
-        three views or fewer: two nearly always agree).
+        Mean distances in pixels: over all views [B], and over the others without each view [B, V] (0
+        for three views or fewer: two nearly always agree).
     """
     of_all = []
     without = []
@@ -120,14 +119,10 @@ def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V
 
 
 def culprit(without: Sequence[float]) -> int | None:
-    """Which of several views, or sets of them, is wrong by itself:
-    the others agree without it alone.
+    """Index of the one view, or set of views, without which the others agree; None if unclear.
 
     Args:
-        without: mean distances of the others without each, in pixels; two or more.
-
-    Returns:
-        Its number, where it is clear; else None.
+        without: mean distances in pixels of the others without each; two or more.
     """
     first, second = sorted(range(len(without)), key=without.__getitem__)[:2]
     is_clear = without[first] + _EXACT < _CLEARLY * (without[second] + _EXACT)
@@ -143,26 +138,24 @@ def _on_cpu(batch: Batch) -> list[Tensor]:
 def coherent_cameras(
     batch: Batch, shared: bool = False, alone: bool = True
 ) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
-    """Cameras with consistent silhouettes; those of an element whose silhouettes are
-    consistent stay.
+    """Move cameras until silhouettes are consistent; elements whose silhouettes are keep theirs.
 
-    Where moving a minority of the cameras is as good as moving all, the others stay. Silhouettes do
-    not tell this from all cameras moving by less, relative to one another.
+    If moving a minority of the cameras is as good as moving all, the others stay; silhouettes cannot
+    distinguish this from smaller relative motions of all cameras.
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-        shared: the elements are instants of one rig, in one frame;
-            its cameras move and zoom alike in all.
-        alone: a minority of the cameras may move by itself.
+        shared: the elements are instants of one rig, in one frame, with common motions and zooms.
+        alone: allow that only a minority of the cameras moves.
 
     Returns:
-        The cameras; which of them were free to move [B, V]; and by how many pixels rays near
-        outlines miss other silhouettes with the given cameras, on average [B]: 0 to 0.00014 with
+        The cameras; which of them were free to move [B, V]; and the mean distance in pixels by which
+        rays near outlines miss other silhouettes with the given cameras [B]: 0 to 0.00014 with
         exact cameras and mattes; with four cameras 0.0001 to 0.0004 if off by up to half a pixel,
-        0.002 by one, 0.04 to 0.08 by three; infinite where no silhouette has an outline.
+        0.002 by one, 0.04 to 0.08 by three; infinite if no silhouette has an outline.
     """
     cameras = batch.cameras
-    # On a CPU: many short steps, and distances to outlines are computed there anyway.
+    # On the CPU: steps are many and short, and distance transforms run there anyway.
     mattes, lens, pose = _on_cpu(batch)
     middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
     each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
@@ -187,12 +180,12 @@ def _coherent(
         mattes: of K instants [K, V, H, W].
         lens: intrinsics of each instant.
         pose: extrinsics, the same at all instants.
-        middle: the subject's middle at each instant, in the frame.
-        alone: a minority of the cameras may move by itself.
+        middle: the subject's centre at each instant, in the frame.
+        alone: allow that only a minority of the cameras moves.
 
     Returns:
-        Intrinsics and extrinsics, which were free,
-        and the mean distance in pixels with the given ones.
+        Intrinsics, extrinsics, which cameras were free, and the mean distance in pixels with the
+        given cameras.
     """
     silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
     every = torch.ones(len(pose), dtype=torch.bool)
@@ -215,7 +208,7 @@ def _coherent(
 
 
 def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | None:
-    """The camera, or the fewest of less than half of them, without which alone the others agree."""
+    """The smallest set of cameras (fewer than half) without which the others agree; None if unclear."""
     count = len(pose)
     for size in range(1, (count + 1) // 2):
         sets = list(combinations(range(count), size))
@@ -227,8 +220,7 @@ def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | 
 
 @dataclass(frozen=True)
 class _Equations:
-    """Normal equations of a Gauss-Newton step,
-    and the number and total distance of rays before it."""
+    """Normal equations of a Gauss-Newton step, and number and total distance of rays before it."""
 
     normal: Float[Tensor, "n n"]
     right: Float[Tensor, " n"]
@@ -244,7 +236,7 @@ class _Equations:
         return _Equations(*sums)
 
     def solved(self, free: Which) -> Float[Tensor, "V 7"]:
-        """The step of the free cameras; 0 for the others."""
+        """Solve for the step of the free cameras; 0 for the others."""
         index = free.repeat_interleave(7).nonzero()[:, 0]
         steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
         return torch.zeros_like(self.right).index_copy(0, index, steps).view(-1, 7)
@@ -252,14 +244,13 @@ class _Equations:
 
 @dataclass(frozen=True)
 class _Silhouettes:
-    """The silhouettes of each instant, and where its subject is in the frame."""
+    """The silhouettes of each instant, and the centre of its subject in the frame."""
 
     outlines: tuple[Outlines, ...]
     middle: Middles
 
     def distance(self, lens: Lenses, pose: Pose, views: Sequence[int] = ()) -> float:
-        """Mean distance in pixels by which rays miss other silhouettes,
-        without those of ``views``."""
+        """Mean distance in pixels by which rays miss other silhouettes, leaving out ``views``."""
         kept = [view for view in range(len(pose)) if view not in views]
         missed = 0.0
         rays = 0
@@ -272,7 +263,7 @@ class _Silhouettes:
         return missed / max(rays, 1)
 
     def equations(self, lens: Lenses, pose: Pose, phase: _Phase) -> "_Equations":
-        """Equations of a Gauss-Newton step of all cameras, summed over the instants."""
+        """Normal equations of a Gauss-Newton step of all cameras, summed over the instants."""
         pixel = _pixel(lens, pose)
         parts = zip(self.outlines, lens, self.middle, strict=True)
         return reduce(add, (_equations(*part, pose, phase, pixel) for part in parts))
@@ -281,19 +272,19 @@ class _Silhouettes:
 def _equations(
     outlines: Outlines, lens: Lens, middle: Float[Tensor, " 3"], pose: Pose, phase: _Phase, pixel: Tensor
 ) -> _Equations:
-    """Equations of one instant.
+    """Normal equations of one instant.
 
     Args:
-        outlines: of its silhouettes.
+        outlines: outlines of its silhouettes.
         lens: its intrinsics.
-        middle: the subject's middle [3] in the frame.
+        middle: the subject's centre [3] in the frame.
         pose: extrinsics in the frame.
-        phase: which distances are minimised.
-        pixel: half the height of the subject, in pixels: what motions and zooms are multiplied by.
+        phase: the distances to minimise.
+        pixel: half the height of the subject in pixels, which scales the unknowns.
 
     Returns:
-        Equations of the motions about the frame's origin and the zooms of all cameras,
-        in about a pixel.
+        Equations of the motions about the frame's origin and the zooms of all cameras, in units of
+        about a pixel.
     """
     count = len(pose)
     pose = _placed(pose, middle)
@@ -316,7 +307,7 @@ def _equations(
 
 
 def _placed(pose: Pose, middle: Float[Tensor, " 3"]) -> Pose:
-    """Poses around the subject's middle, where rays are searched."""
+    """Shift poses to the subject's centre, around which rays are searched."""
     return after_motions(pose, F.pad(middle, (3, 0)).expand(len(pose), 6), pose.new_zeros(3))
 
 
@@ -326,17 +317,8 @@ def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
 
 
 def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
-    """Cameras after a step.
-
-    Args:
-        steps: motions and zooms, in about a pixel [V, 7].
-        lens: intrinsics of each instant.
-        pose: extrinsics.
-        are_all: all cameras are free, so that what is common to all is left out.
-
-    Returns:
-        Intrinsics and extrinsics.
-    """
+    """Apply motions and zooms ``steps`` (in units of about a pixel) to intrinsics and extrinsics; with
+    ``are_all``, all cameras are free, and the common motion and zoom are removed."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
     if are_all:
         motions = without_common(motions, pose[:, 2, :3])

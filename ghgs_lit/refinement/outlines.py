@@ -1,5 +1,5 @@
-"""Distance maps of the outlines of one instant's silhouettes, and the rays that pass near them: their deepest
-points in other silhouettes, and derivatives of these depths."""
+"""Distance maps of one instant's silhouettes, and rays near their outlines: the deepest points of rays
+in other silhouettes, and derivatives of these depths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,20 +20,20 @@ Numbers = Int[Tensor, " R"]  #: A silhouette for each ray
 Points = Float[Tensor, "R 3"]  #: A point or vector for each ray
 _DEPTHS = 48  #: Depths tried along a ray
 
-_FINER = 4  #: Size of the distance maps relative to photographs
+_FINER = 4  #: Size of the distance maps relative to the images
 _FAR = 20.0  #: Distances are clamped to this, in pixels
-_FROM = 0.25  #: Least depth inside the outline, in pixels, of rays that are tried
-TO = 8.0  #: Largest depth of these
-#: Size of the maps, greatest depth of rays in pixels, and every how many rays one is used.
+_FROM = 0.25  #: Least depth inside the outline, in pixels, of rays that are used
+TO = 8.0  #: Largest such depth
+#: Size of the maps relative to the images, largest depth of rays in pixels, stride over rays.
 CAREFUL = (_FINER, TO, 1)
 QUICK = (1, 1.5, 2)
-_REACH = 0.75  #: Half the step in pixels of slopes of a distance map
+_REACH = 0.75  #: Half the step in pixels of finite differences of a distance map
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays
-    near it: ray ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside
+    """Signed distances in pixels to the outline of each silhouette, positive inside, and the rays near
+    it: ray ``r`` passes through ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside
     the outline."""
 
     maps: Float[Tensor, "V 1 h w"]
@@ -45,15 +45,15 @@ class Outlines:
 
     @classmethod
     def of(cls, mattes: Float[Tensor, "V H W"], look: tuple[int, float, int] = CAREFUL) -> "Outlines":
-        """Outlines of the silhouettes of one instant.
+        """Compute the outlines of the silhouettes of one instant.
 
         Args:
-            mattes: shares of pixels that show the subject [V, H, W], in [0, 1], on a CPU.
-            look: size of the maps relative to the mattes, greatest depth of rays in pixels, and
-                every how many rays one is used.
+            mattes: [V, H, W] in [0, 1], on a CPU.
+            look: size of the maps relative to the mattes, largest depth of rays in pixels, and stride
+                over rays.
 
         Returns:
-            Distance maps, and the rays in ascending order of silhouettes.
+            Distance maps, and rays in ascending order of silhouettes.
         """
         finer, to, every = look
         size = (mattes.shape[1], mattes.shape[2])
@@ -68,14 +68,7 @@ class Outlines:
         return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
 
     def of_views(self, kept: Sequence[int]) -> "Outlines":
-        """Those of some silhouettes.
-
-        Args:
-            kept: their numbers, ascending.
-
-        Returns:
-            The outlines, whose silhouettes are numbered anew.
-        """
+        """Select silhouettes by ascending indices ``kept``, and renumber them from 0."""
         if len(kept) == len(self.maps):
             return self
         numbers = torch.tensor(kept)
@@ -86,15 +79,12 @@ class Outlines:
         )
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Distances at pixels; beyond the photograph those at its border,
-        where a subject may go on.
+        """Signed distances [...] in pixels, positive inside; beyond the image those at its border, since
+        a subject may continue there.
 
         Args:
-            view: number of the silhouette of each pixel [...].
-            pixels: ``(u, v)`` in the photograph [..., 2].
-
-        Returns:
-            Signed distances [...] in pixels, above 0 inside.
+            view: index of the silhouette of each pixel [...].
+            pixels: ``(u, v)`` in the image [..., 2].
         """
         half = 0.5 / self.finer
         within = torch.minimum(pixels.clamp(min=half), pixels.new_tensor(self.size[::-1]) - half)
@@ -103,20 +93,20 @@ class Outlines:
     def along(
         self, view: int, lens: Tensor, pose: Tensor, start: Tensor, ahead: Tensor, depths: Float[Tensor, " D"]
     ) -> Float[Tensor, "R D"]:
-        """Distances in a silhouette at the points ``start + depth * ahead`` of rays.
+        """Signed distances in a silhouette at the points ``start + depth * ahead`` of rays.
 
         Args:
-            view: number of the silhouette.
+            view: index of the silhouette.
             lens: its intrinsics [3, 3] in pixels.
             pose: its extrinsics [4, 4].
-            start: where all rays start [3], in the world.
-            ahead: what a unit of depth adds to each ray [R, 3].
-            depths: that are tried on each ray [D].
+            start: common origin of the rays [3], in the world.
+            ahead: direction of each ray per unit of depth [R, 3].
+            depths: depths of the points on each ray [D].
 
         Returns:
-            Signed distances [R, D] in pixels, above 0 inside; without a meaning behind the camera.
+            Distances [R, D] in pixels, positive inside; meaningless behind the camera.
         """
-        # Places from -1 to 1 over the photograph: ratios of functions that are linear in depth.
+        # Positions in [-1, 1] over the image: ratios of functions that are linear in depth.
         height, width = self.size
         onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
         first = onto @ (pose[:3, :3] @ start + pose[:3, 3])
@@ -128,14 +118,11 @@ class Outlines:
         return F.grid_sample(one, places, padding_mode="border", align_corners=False)[0, 0]
 
     def slopes(self, view: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """Gradients of the distances in the photograph.
+        """Gradients of the distances in the image: change per pixel to the right and down [n, 2].
 
         Args:
-            view: number of the silhouette of each pixel [n].
+            view: index of the silhouette of each pixel [n].
             pixels: ``(u, v)`` [n, 2].
-
-        Returns:
-            Changes of the distance per pixel to the right and down [n, 2].
         """
         steps = _REACH * torch.eye(2).to(pixels)
         rises = [self.at(view, pixels + step) - self.at(view, pixels - step) for step in steps]
@@ -145,18 +132,18 @@ class Outlines:
 def best_points(
     outlines: Outlines, lens: Lens, pose: Pose, view: Numbers, pixels: Float[Tensor, "R 2"]
 ) -> tuple[Points, Numbers, Float[Tensor, " R"]]:
-    """The point of each ray that is deepest in the other silhouettes.
+    """Find the point of each ray that is deepest in the other silhouettes.
 
     Args:
-        outlines: of the silhouettes of one instant.
+        outlines: outlines of the silhouettes of one instant.
         lens: its intrinsics.
-        pose: extrinsics around the subject's middle.
-        view: the silhouette of each ray, ascending.
-        pixels: that the rays pass [R, 2].
+        pose: extrinsics around the subject's centre.
+        view: index of the silhouette of each ray, ascending.
+        pixels: pixels that the rays pass through [R, 2].
 
     Returns:
-        Points [R, 3]; the other silhouette that each is least deep in [R]; and its signed depth in
-        that in pixels [R].
+        Points [R, 3]; the other silhouette in which each is least deep [R]; and its signed depth
+        there, in pixels [R].
     """
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
@@ -185,14 +172,14 @@ def gradients_of(outlines: Outlines, lens: Lens, pose: Pose, points: Points, oth
     """Derivatives of the distances with respect to the points.
 
     Args:
-        outlines: of the silhouettes of one instant.
+        outlines: outlines of the silhouettes of one instant.
         lens: its intrinsics.
         pose: extrinsics.
-        points: one for each ray.
-        other: the silhouette that each distance is in.
+        points: one per ray.
+        other: index of the silhouette of each distance.
 
     Returns:
-        Vectors [R, 3] in the world's axes, in pixels per unit of the frame.
+        Vectors [R, 3] in world axes, in pixels per unit of the frame.
     """
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
@@ -205,17 +192,17 @@ def gradients_of(outlines: Outlines, lens: Lens, pose: Pose, points: Points, oth
 def rows_of(
     points: Points, gradients: Points, pose: Float[Tensor, "R 4 4"], middle: Float[Tensor, " 3"]
 ) -> Float[Tensor, "R 7"]:
-    """Derivatives of the distances with respect to a camera's motion and zoom.
+    """Derivatives of the distances with respect to a camera's motion and zoom: rows of the Jacobian.
 
     Args:
-        points: one for each ray, around the subject's middle.
+        points: one per ray, relative to the subject's centre.
         gradients: derivatives with respect to these.
         pose: extrinsics of the camera of each ray [R, 4, 4].
-        middle: the subject's middle [3] in the frame.
+        middle: the subject's centre [3] in the frame.
 
     Returns:
-        [R, 7]: by the rotation vector about the frame's origin, the shift in half heights, and the
-        logarithm of the focal length, which moves points away from the optical axis.
+        [R, 7]: with respect to the rotation vector about the frame's origin, the shift in half
+        heights, and the logarithm of the focal length, which moves points away from the optical axis.
     """
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)

@@ -1,7 +1,7 @@
-"""Optimisation of predicted Gaussians towards the input photographs.
+"""Optimisation of predicted Gaussians towards the input images.
 
-A few steps suffice, and every change is bounded, so that what no photograph shows stays as
-predicted. Inputs that are reproduced say nothing about other views (wrong geometry reproduces them,
+A few steps suffice, and every change is bounded, so that parts that no input view shows stay as
+predicted. Good renders of the inputs are no evidence for other views (wrong geometry reproduces them,
 too), so :meth:`Refinement.report` holds one out and predicts again from the others."""
 
 from collections.abc import Callable, Mapping
@@ -20,30 +20,30 @@ from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
-Seen = tuple[Tensor, Tensor, Cameras]  #: Photographs on black, silhouettes and cameras
+Seen = tuple[Tensor, Tensor, Cameras]  #: Input images on black, silhouettes and cameras
 
 
 @dataclass(frozen=True)
 class Change:
-    """The largest change of a value, and the step of Adam near its start."""
+    """Bound of a value's change, and Adam's learning rate."""
 
     limit: float
     rate: float
 
 
-#: Changes so small that what no photograph shows stays as predicted.
+#: Changes so small that parts that no input view shows stay as predicted.
 NEAR = {
     "means": Change(1.0, 0.04),
     "scales": Change(1.0, 0.03),
     "opacities": Change(2.0, 0.04),
     "colors": Change(0.05, 0.001),
 }
-#: Times that what a pixel lacks of fine detail is added to the colour of its Gaussian at the end.
-#: Above 1: a pixel shows its own Gaussian and others, of other photographs too.
+#: Factor of a pixel's missing fine detail that is finally added to the colour of its Gaussian. Above
+#: 1, since a pixel shows not only its own Gaussian but also those of other pixels and views.
 DETAIL = 2.0
-#: The largest such change of a colour.
+#: Largest such change of a colour.
 DETAIL_LIMIT = 0.1
-#: Share of a pixel above which the subject covers it.
+#: Matte above which a pixel is entirely covered by the subject.
 WHOLE = 0.99
 #: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
 Weights = tuple[float, float, float]
@@ -52,8 +52,8 @@ WEIGHTS: Weights = (0.8, 0.2, 0.1)
 
 @dataclass(frozen=True)
 class Report:
-    """PSNR in dB in the subject's box before and after: of the inputs, and (of four or more) of
-    one held out."""
+    """PSNR in dB in the subject's box before and after: of the inputs, and, with four or more, of one
+    held out."""
 
     steps: int
     inputs: tuple[float, float]
@@ -67,15 +67,15 @@ class Report:
 
 
 class Descent:
-    """Bounded changes of Gaussians, at first 0, and their optimiser.
+    """Bounded changes of Gaussians, initially 0, and their optimiser.
 
     Args:
         gaussians: predicted from ``batch``, each at a pixel of an input.
-        batch: None where ``means`` do not change.
-        changes: what may change, as for :class:`Refinement`.
+        batch: may be None if ``means`` do not change.
+        changes: as for :class:`Refinement`.
 
     Raises:
-        InputError: ``means`` change, but the Gaussians belong to no pixel.
+        InputError: ``means`` change, but the Gaussians have no pixels.
     """
 
     def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
@@ -85,26 +85,23 @@ class Descent:
             require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
             self._footprint = _footprints(self.start, batch)
         self._raw = {n: torch.zeros_like(getattr(self.start, n), requires_grad=True) for n in changes}
-        # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
+        # A negligible epsilon: the loss is a mean, whose gradients shrink with image and batch size.
         groups = [{"params": [self._raw[name]], "lr": change.rate} for name, change in changes.items()]
         self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95), eps=1e-15)
 
     @property
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
-        """The Gaussians as they are now, without a gradient."""
+        """The current Gaussians, without a gradient."""
         return self._changed()
 
     def step(self, renderer: Renderer, seen: Seen, weights: Weights = WEIGHTS) -> Rendering:
-        """Take a step towards photographs.
+        """Take one optimiser step, and return the renders before it.
 
         Args:
-            renderer: draws the inputs, with gradients.
-            seen: of :func:`seen_by`.
-            weights: of L1, 1 - SSIM and L1 of the silhouette.
-
-        Returns:
-            The renders before the step.
+            renderer: renders the input views, with gradients.
+            seen: from :func:`seen_by`.
+            weights: weights of L1, 1 - SSIM and L1 of the silhouette.
         """
         with exact(self.start.means.device.type), torch.enable_grad():
             drawn = renderer(self._changed(), seen[2], background=0.0)
@@ -129,18 +126,18 @@ class Descent:
 
 
 class Refinement:
-    """``refinement(gaussians, batch)``: the same Gaussians, nearer to the photographs.
+    """Refine Gaussians towards the input images: ``refinement(gaussians, batch) -> Gaussians``.
 
-    Splats that overlap blur what they show, and no step of a mean error undoes it: it is small.
-    So what is missing of fine detail goes to the colours at last. Low frequencies stay as they are,
-    which photographs of other exposures, and wrong geometry, would spoil.
+    Overlapping splats blur fine detail, and steps on a mean error hardly restore it, because its share
+    of the error is small. So the missing detail is finally added to the colours. Low frequencies are
+    left out: different exposures and wrong geometry would spoil them.
 
     Args:
-        steps: of the optimiser, 1 or more.
-        renderer: draws the inputs, with gradients.
-        changes: by field, what may change: means in footprints of their pixels, scales by their
-            logarithm, opacities by their logit, quaternions, colours. Other fields stay.
-        detail: times that fine detail which is missing is added to colours, 0 or more.
+        steps: number of optimiser steps, 1 or more.
+        renderer: renders the input views, with gradients.
+        changes: bounds by field: means in footprints of their pixels, scales as logarithms,
+            opacities as logits, quaternions, colours. Other fields stay.
+        detail: factor of the missing fine detail that is added to colours, 0 or more.
 
     Raises:
         InputError: ``steps`` is below 1.
@@ -160,17 +157,10 @@ class Refinement:
         self.detail = detail
 
     def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
-        """The refined Gaussians.
-
-        Args:
-            gaussians: predicted from ``batch``.
-            batch: whose photographs they get nearer to.
-
-        Returns:
-            Gaussians in the same order, without a gradient.
+        """Refine Gaussians predicted from ``batch``; returns them in the same order, without a gradient.
 
         Raises:
-            InputError: they do not belong to pixels of ``batch``.
+            InputError: the Gaussians do not belong to pixels of ``batch``.
         """
         if self.detail:
             require(gaussians.pixel is not None, "refine", "Gaussians of the inputs' pixels", "others")
@@ -183,19 +173,16 @@ class Refinement:
     def report(
         self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]
     ) -> Report:
-        """The gain of a refinement.
+        """Measure the gain of a refinement: PSNR before and after.
 
-        Of four inputs or more the last is held out (two that remain would show too little of a
-        person), which takes as long as prediction and refinement.
+        With four or more inputs the last one is held out (two remaining views would show too little
+        of a person), which takes as long as prediction and refinement.
 
         Args:
             gaussians: before the refinement.
             refined: after it.
             batch: one element, from which both were predicted.
-            predict: gives the Gaussians of a batch, here of the inputs without the last.
-
-        Returns:
-            PSNR before and after.
+            predict: predicts the Gaussians of a batch, here of the inputs without the last.
         """
         inputs = tuple(self._psnr(splats, batch) for splats in (gaussians, refined))
         held_out = None
@@ -209,8 +196,8 @@ class Refinement:
 
     @torch.no_grad()
     def _detailed(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
-        """Gaussians whose colours have what their own pixels lack of fine detail: the error there
-        without its mean in 3 x 3 pixels, 2 pixels or more within the outline."""
+        """Add to each colour the missing detail of its pixel: the error minus its mean over 3 x 3
+        pixels, at pixels 2 or more inside the outline."""
         photographs, silhouettes, cameras = seen_by(batch)
         with exact(gaussians.means.device.type):
             drawn = self.renderer(gaussians, cameras, background=0.0).image
@@ -231,12 +218,12 @@ class Refinement:
 
 
 def seen_by(batch: Batch) -> Seen:
-    """Photographs on black, silhouettes [B, V, 1, H, W] and cameras of the inputs."""
+    """Input images on black, silhouettes [B, V, 1, H, W] and cameras."""
     return on_black(batch), coverage(batch)[:, :, None], batch.cameras
 
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
-    """Side [N, 1] of a pixel at each Gaussian's depth in its image, in the unit of the world."""
+    """Size [N, 1] of a pixel at each Gaussian's depth in its image, in the unit of the world."""
     extrinsics = batch.cameras.extrinsics.flatten(0, 1)
     intrinsics = batch.cameras.intrinsics.flatten(0, 1)
     image = gaussians.image
@@ -247,17 +234,7 @@ def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
 
 
 def _loss(drawn: Rendering, photographs: Tensor, silhouettes: Tensor, weights: Weights) -> Tensor:
-    """Difference of renders and photographs (the paper's L_render, and L1 of silhouettes).
-
-    Args:
-        drawn: renders of the inputs.
-        photographs: on black [B, V, 3, H, W].
-        silhouettes: shares of pixels that show the subject [B, V, 1, H, W].
-        weights: of L1, 1 - SSIM (not computed if 0) and L1 of the silhouette.
-
-    Returns:
-        A scalar.
-    """
+    """The paper's L_render plus L1 of silhouettes; SSIM is not computed if its weight is 0."""
     l1, dissimilar, outline = weights
     loss = l1 * (drawn.image - photographs).abs().mean() + outline * (drawn.alpha - silhouettes).abs().mean()
     if not dissimilar:
