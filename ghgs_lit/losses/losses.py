@@ -14,24 +14,24 @@ from ghgs_lit.types import Batch, Prediction, Rendering
 
 
 class LossWeights(Options):
-    """Weight of each term, by its name; a term of weight 0 is not computed. Terms that a plug-in
-    registers have a key, too."""
+    """Weight of each term by name; a term of weight 0 is not computed. Terms that a plug-in registers
+    have a key, too."""
 
     model_config = ConfigDict(extra="allow")
     group = "loss.weights"
     render_l1: Amount = 0.8
-    """Mean |render - photograph| (paper: 0.8)."""
+    """Mean |render - target| (paper: 0.8)."""
     render_ssim: Amount = 0.2
-    """1 - SSIM of render and photograph (paper: 0.2)."""
+    """1 - SSIM of render and target (paper: 0.2)."""
     chamfer: Amount = 1.0
-    """Unprojected pixels to body vertices, m^2 (paper: 1.0); the data must have body vertices."""
+    """Chamfer distance of unprojected pixels and body vertices in m^2 (paper: 1.0); the data must have
+    body vertices."""
     depth: Amount = 0.0
-    """|z - true z| in metres, the sum over rounds (not in the paper);
-    the data must have depth maps."""
+    """|z - true z| in metres, summed over rounds (not in the paper); the data must have depth maps."""
     silhouette: Amount = 0.0
     """Mean |alpha - mask| of the target views (not in the paper)."""
     lpips: Amount = 0.0
-    """LPIPS of render and photograph (not in the paper); extra lpips."""
+    """LPIPS of render and target (not in the paper); needs the extra lpips."""
 
 
 class Losses(Options):
@@ -39,17 +39,17 @@ class Losses(Options):
 
     group = "loss"
     weights: LossWeights = LossWeights()
-    """Weight of each term, by its name; register("term", name) adds a term."""
+    """Weight of each term by name; register("term", name) adds a term."""
     chamfer_points: Count | None = None
-    """Points of each set that the Chamfer term matches in a step, chosen at random;
+    """Number of points of each set, sampled at random in each step, that the Chamfer term matches;
     null: all (paper)."""
 
     @cached_property
     def terms(self) -> dict[str, Callable[[Prediction, Rendering, Batch], Tensor]]:
-        """The terms whose weight is above 0, by name.
+        """Terms with a weight above 0, by name.
 
         Raises:
-            InputError: a term is not registered, or lacks its package or weights."""
+            InputError: a term is not registered, or its package or weights are missing."""
         terms: dict[str, Any] = {}
         for name, weight in self.weights:
             term = class_of(TERM, name, f"weights.{name}")
@@ -68,24 +68,24 @@ class Losses(Options):
 
     @property
     def reads_depths(self) -> bool:
-        """Whether a term compares with true depths; a plug-in's may."""
+        """Whether a term may read true depths; a plug-in's term is assumed to."""
         return self.weights.depth > 0 or bool(self.weights.model_extra)
 
     def __call__(
         self, prediction: Prediction, rendering: Rendering, batch: Batch
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss of a training step.
+        """Compute the loss of a training step.
 
         Args:
             prediction: of the model for the batch.
-            rendering: its Gaussians from the target cameras.
+            rendering: its Gaussians rendered from the target cameras.
             batch: with targets, and body vertices or depth maps where a term reads them.
 
         Returns:
-            The weighted total, and each term before its weight by name, all without dimensions.
+            The weighted sum, and each unweighted term by name; all scalars.
 
         Raises:
-            InputError: the data has no body vertices or depth maps for a term that reads them."""
+            InputError: the data lacks body vertices or depth maps that a term reads."""
         values = {name: term(prediction, rendering, batch) for name, term in self.terms.items()}
         total = sum(getattr(self.weights, name) * value for name, value in values.items())
         return total, values

@@ -1,8 +1,8 @@
-"""The terms of the training loss.
+"""Terms of the training loss.
 
 Every term takes a prediction, its Gaussians rendered from the batch's target cameras, and the
-batch, and returns a scalar without dimensions, in float32 or wider. It is a function, or a class
-that is made without arguments and called; :mod:`ghgs_lit.config.registry` lists them by name."""
+batch, and returns a scalar in float32 or wider. A term is a function, or a class whose instances,
+built without arguments, are called; :mod:`ghgs_lit.config.registry` lists them by name."""
 
 import torch
 import torch.nn.functional as F
@@ -24,7 +24,7 @@ Scalar = Float[Tensor, ""]
 
 
 def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
-    """Mean |render - photograph| over the whole image (first term of the paper's L_render).
+    """Mean |render - target| over the whole image (first term of the paper's L_render).
 
     Args:
         prediction: not used.
@@ -37,10 +37,9 @@ def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Sca
 
 
 def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
-    """1 - SSIM over the whole image, without padding,
-    as the authors train (second term of L_render).
+    """1 - SSIM over the whole image without padding, as the authors train (second term of L_render).
 
-    On a CPU only windows in which the images differ are computed; in all others the term is 0.
+    On a CPU, only windows in which the images differ are computed; elsewhere the term is 0.
 
     Args:
         prediction: not used.
@@ -51,7 +50,7 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
         The mean over all windows and channels, in [0, 2].
 
     Raises:
-        InputError: the images are smaller than a window."""
+        InputError: the images are smaller than the SSIM window."""
     image = rendering.image.flatten(0, 1)
     target = batch.targets.images.flatten(0, 1)
     reach = SSIM_WINDOW - 1
@@ -65,13 +64,13 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
 
 
 def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None) -> Scalar:
-    """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom).
+    """Chamfer distance between the subject's unprojected pixels and the body vertices (L_geom).
 
     Args:
-        prediction: its points are those before the Gaussian head's offset, in metres.
+        prediction: its points, before the Gaussian head's offset, in metres.
         rendering: not used.
         batch: with body vertices in metres.
-        points: how many of each set are matched, sampled at random; None: all.
+        points: number of points of each set that are matched, sampled at random; None: all.
 
     Returns:
         The mean over the batch, in square metres.
@@ -97,16 +96,15 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
 def _rows_of_gaussians(
     prediction: Prediction, used: Bool[Tensor, "B V H W"]
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]] | None:
-    """Points of the pixels that Gaussians belong to, whose number needs no device-to-host synchronisation.
+    """Points of the Gaussians' pixels, in fixed shapes without a device-to-host synchronisation.
 
     Args:
-        prediction: each of its valid pixels has a Gaussian; a shape bucket may be filled by Gaussians
-            of pixels that precede them.
-        used: pixels that count.
+        prediction: each of its valid pixels has a Gaussian; a shape bucket may be filled up with
+            copies of the preceding Gaussian.
+        used: pixels to use.
 
     Returns:
-        Points [n, 3] of each element, and which of them count [n];
-        None: Gaussians belong to no pixels.
+        Points [n, 3] of each element, and which of them to use [n]; None if Gaussians have no pixels.
     """
     gaussians = prediction.gaussians
     if gaussians.image is None or not all(gaussians.splits):
@@ -120,16 +118,16 @@ def _rows_of_gaussians(
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """Mean |z - true z| over the subject's pixels with a true depth.
 
-    With rounds, the sum over the depths before the first round and after each, as RAFT's sequence
+    With rounds, summed over the depths before the first round and after each, like RAFT's sequence
     loss (Teed and Deng, ECCV 2020) without its weights.
 
     Args:
         prediction: depths of each round [B, V, H, W] in metres.
         rendering: not used.
-        batch: with true depths in metres, 0 where there are none.
+        batch: with true depths in metres, 0 where unknown.
 
     Returns:
-        Metres; 0 where no pixel has a true depth.
+        Metres; 0 if no pixel has a true depth.
 
     Raises:
         InputError: the data has no depth maps."""
@@ -151,18 +149,21 @@ def silhouette(prediction: Prediction, rendering: Rendering, batch: Batch) -> Sc
         batch: with masks of the targets [B, T, h, w].
 
     Returns:
-        The mean over all pixels, from 0 to 1."""
+        The mean over all pixels, in [0, 1]."""
     return (at_least_float32(rendering.alpha)[:, :, 0] - batch.targets.masks.float()).abs().mean()
 
 
 class Perceptual:
-    """LPIPS of the target images, as of the metric; raises InputError without its package or weights."""
+    """LPIPS of the target images, as in the metric.
+
+    Raises:
+        InputError: the package or its weights are missing."""
 
     def __init__(self) -> None:
         self.metric = LPIPS(key="weights.lpips")
 
     def __call__(self, prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
-        """The mean over the images.
+        """Mean over the images.
 
         Args:
             prediction: not used.

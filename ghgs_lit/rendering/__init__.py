@@ -1,4 +1,4 @@
-"""Rendering of Gaussians: ``render`` and ``Renderer``; ``settings`` defines the image."""
+"""Rendering of Gaussians: ``render`` and ``Renderer``; ``RasterSettings`` defines the image."""
 
 from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.rendering.api import Renderer, render

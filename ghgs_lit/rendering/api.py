@@ -1,4 +1,4 @@
-"""Rendering of Gaussians by one function with three backends."""
+"""Rendering of Gaussians: one function with three backends."""
 
 import dataclasses
 import importlib
@@ -46,27 +46,27 @@ def render(
     Differentiable in means, quaternions, scales, opacities, colours and background. Any number
     ``C`` of colour channels, any image size and any number of Gaussians per element, including
     none. The image is defined by :class:`ghgs_lit.ops.rasterization.settings.RasterSettings`, as in 3D
-    Gaussian Splatting (Kerbl et al. 2023).
+    Gaussian Splatting (Kerbl et al., 2023).
 
     Args:
         gaussians: N Gaussians of all elements, ``splits`` of them in each; a zero quaternion is the
-            identity; a Gaussian with NaN in its geometry or opacity is not drawn.
+            identity; Gaussians with NaN in their geometry or opacity are not rendered.
         cameras: [B, T], without skew; all of one image size (h, w).
         backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the
             dtype of the means, slow; also differentiable in the cameras) or ``auto``: gsplat
             on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
-        near: metres > 0 (see ``gaussians.metre``);
-            Gaussians whose centre has ``z < near`` are not drawn.
-        far: metres > ``near``; Gaussians whose centre has ``z > far`` are not drawn.
-        settings: constants of the image; None: those that the Gaussians were made for.
+        near: metres > 0 (see ``gaussians.metre``); Gaussians whose centre has ``z < near`` are
+            culled.
+        far: metres > ``near``; Gaussians whose centre has ``z > far`` are culled.
+        settings: constants of the image; None: those that the Gaussians were predicted for.
 
     Returns:
         Image [B, T, C, h, w], alpha [B, T, 1, h, w] in [0, 1], and expected depth [B, T, 1, h, w]
-        in the unit of the means, 0 where no Gaussian is seen.
+        in the unit of the means, 0 where no Gaussian is visible.
 
     Raises:
-        InputError: inputs that do not fit together.
+        InputError: shapes, cameras or options are inconsistent.
         BackendUnavailable: gsplat cannot run on this machine.
     """
     settings = settings or made_for(gaussians)
@@ -90,27 +90,20 @@ def render(
 
 
 def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
-    """The settings that Gaussians were made for.
-
-    Args:
-        gaussians: their ``low_pass`` and ``antialiased`` are taken over.
-        settings: further fields of :class:`RasterSettings`.
-    """
+    """Settings that the Gaussians were predicted for: their ``low_pass`` and ``antialiased``, and
+    further fields of :class:`RasterSettings` in ``settings``."""
     return RasterSettings(low_pass=gaussians.low_pass, antialiased=gaussians.antialiased, **settings)
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
-    """The backend for tensors on ``device``, with ``auto`` resolved.
+    """Backend for Gaussians on ``device``: ``gsplat``, ``cpu`` or ``reference``.
 
     Args:
         backend: one of :data:`BACKENDS`.
-        device: where the Gaussians are.
-
-    Returns:
-        ``gsplat``, ``cpu`` or ``reference``.
+        device: device of the Gaussians.
 
     Raises:
-        InputError: an unknown backend, or one that does not run on ``device``.
+        InputError: the backend is unknown or does not run on ``device``.
         BackendUnavailable: gsplat cannot run on this machine.
     """
     choice("renderer.backend", backend, BACKENDS)
@@ -129,40 +122,26 @@ class Renderer(Options):
 
     group = "renderer"
     backend: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
-    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch);
-    auto: by the device."""
+    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch, slow); auto: gsplat
+    on CUDA, else cpu."""
     background: float | tuple[float, ...] = 0.0
     """Colour behind the Gaussians: one number or one for each channel."""
     near: Positive = 0.01
-    """Metres; Gaussians whose centre is nearer are not drawn."""
+    """Near plane in metres: Gaussians whose centre is nearer are not rendered."""
     alpha_max: float = Field(0.999, gt=0, lt=1)
     """Upper limit of a Gaussian's alpha; gsplat applies it to opacities."""
 
     def __call__(
         self, gaussians: Gaussians, cameras: Cameras, background: Background | None = None
     ) -> Rendering:
-        """:func:`render` with these options.
-
-        Args:
-            gaussians: as in :func:`render`.
-            cameras: as in :func:`render`.
-            background: replaces the configured one if given.
-
-        Returns:
-            As :func:`render`.
-
-        Raises:
-            InputError: inputs that do not fit together.
-            BackendUnavailable: gsplat cannot run on this machine.
-        """
+        """:func:`render` with these options; ``background``, if given, overrides the configured one."""
         background = self.background if background is None else background
         settings = made_for(gaussians, alpha_max=self.alpha_max)
         return render(gaussians, cameras, self.backend, background, self.near, FAR, settings)
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
-    """Raise InputError where shapes of Gaussians and cameras do not fit together,
-    or a camera has skew."""
+    """Raise InputError if shapes of Gaussians and cameras are inconsistent, or a camera has skew."""
     count = len(gaussians)
     shapes = {"means": (count, 3), "quaternions": (count, 4), "scales": (count, 3), "opacities": (count,)}
     for name, shape in shapes.items():
@@ -181,7 +160,7 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
-    """Gaussians in float64 if any of their tensors is, else in float32."""
+    """Convert Gaussians to float64 if any of their tensors is, else to float32."""
     fields = ("means", "quaternions", "scales", "opacities", "colors")
     tensors = {name: at_least_float32(getattr(gaussians, name)) for name in fields}
     is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
@@ -191,8 +170,8 @@ def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
 
 
 def _of_each(values: Tensor, gaussians: Gaussians) -> Tensor:
-    """``values`` of the elements [B, ...], repeated for each of their Gaussians."""
-    if len(set(gaussians.splits)) == 1:  # no number has to be copied to a GPU
+    """Repeat values of elements [B, ...] for each of their Gaussians."""
+    if len(set(gaussians.splits)) == 1:  # avoids a copy to the GPU
         return values.repeat_interleave(gaussians.splits[0], dim=0)
     counts = torch.tensor(gaussians.splits).to(values.device, non_blocking=True)
     return values.repeat_interleave(counts, dim=0, output_size=len(gaussians))
@@ -212,8 +191,8 @@ def _around_cameras(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, 
 
 
 def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Gaussians and cameras in metres; ``gaussians.metre`` is the length of a metre in
-    each scene."""
+    """Scale Gaussians and cameras to metres; ``gaussians.metre`` is the length of a metre in the unit
+    of each scene."""
     if gaussians.metre is None:
         return gaussians, cameras
     lengths = _of_each(gaussians.metre.to(gaussians.means), gaussians)[:, None]
@@ -226,11 +205,7 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor:
-    """The background as a tensor that broadcasts with the image.
-
-    Args:
-        background: as of :func:`render`.
-        color: the rendered image, for its channels, dtype and device.
+    """Convert a background to a tensor that broadcasts with the image ``color``.
 
     Raises:
         InputError: neither one number nor one per channel.

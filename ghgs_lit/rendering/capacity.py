@@ -1,10 +1,9 @@
-"""How many intersections of splats with tiles there is room for,
-and what happens where there are more.
+"""Capacity of the buffers for intersections of splats with tiles.
 
-Reading the number of intersections would be a device-to-host synchronisation before anything is
-rendered. So each rendering gets the room that similar ones needed, and some more; the number that it
-really needed is read later: while the GPU renders, or after several renderings (:func:`settled`). Where
-the room was too small the rendering is repeated with enough: an image never lacks splats."""
+Reading the number of intersections would synchronise device and host before anything is rendered. So
+each rendering gets the capacity that similar ones needed, with a margin; the number that it really
+needed is read later: while the GPU renders, or after several renderings (:func:`settled`). If the
+capacity was too small, the rendering is repeated with enough: an image never lacks splats."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -21,27 +20,26 @@ from ghgs_lit.extents import bucket_size
 
 T = TypeVar("T")
 Drawn = TypeVar("Drawn")
-#: Tiles that a splat is expected to touch at first, and what is added to the most that was seen.
+#: Initial estimate of the number of tiles that a splat touches, and safety factor of capacities.
 _FIRST = 4.0
 _SPARE = 1.25
-#: Share of a difference by which an expectation falls if less was needed; it rises at once.
+#: Fraction of the difference by which the estimate decreases if less was needed; it increases at once.
 _FALL = 0.1
 
-#: Tiles of an image (rows, columns): what is expected for them depends on nothing else
-#: that is known.
+#: Tiles of an image (rows, columns), the key of the estimates.
 Grid = tuple[int, int]
 _expected: dict[Grid, float] = {}
 
 
 @dataclass(frozen=True)
 class Room:
-    """Room that a rendering had, and the number that it ``needed``, on its device.
+    """Capacity that a rendering had, and what it needed.
 
     Attributes:
         grid: tiles of an image (rows, columns).
-        splats: number of all images together.
-        capacity: number of intersections that there was room for.
-        needed: number of intersections that there were, a scalar on the device of the rendering.
+        splats: number of splats of all images together.
+        capacity: largest number of intersections in the buffers.
+        needed: actual number of intersections, a scalar on the device of the rendering.
     """
 
     grid: Grid
@@ -50,14 +48,8 @@ class Room:
     needed: Int[Tensor, ""]
 
     def expect(self, needed: int) -> bool:
-        """Note what was needed; later renderings of the same grid expect it.
-
-        Args:
-            needed: number of intersections, as read by the host.
-
-        Returns:
-            Whether the room sufficed.
-        """
+        """Update the estimate for later renderings of the same grid; returns whether the capacity
+        sufficed for ``needed`` intersections."""
         per_splat = needed / self.splats
         before = _expected.get(self.grid, 0.0)
         _expected[self.grid] = max(per_splat, before + _FALL * (per_splat - before))
@@ -66,12 +58,12 @@ class Room:
 
 @dataclass
 class Rooms:
-    """Rooms of the renderings in a context, in their order."""
+    """Capacities of the renderings in a context, in order."""
 
     rooms: list[Room] = field(default_factory=list)
 
     def suffice(self) -> bool:
-        """Whether every rendering had enough room; the host waits once."""
+        """Whether every rendering had enough capacity; one device-to-host synchronisation."""
         if not self.rooms:
             return True
         numbers = torch.stack([room.needed for room in self.rooms]).tolist()
@@ -83,8 +75,8 @@ _rooms: ContextVar[Rooms | None] = ContextVar("rooms", default=None)
 
 @contextmanager
 def deferred() -> Iterator[Rooms]:
-    """Inside, renderings do not check their rooms:
-    who opens this must see whether they ``suffice``."""
+    """Context in which renderings do not check their capacities: the caller must check
+    :meth:`Rooms.suffice`."""
     rooms = Rooms()
     token = _rooms.set(rooms)
     try:
@@ -94,14 +86,14 @@ def deferred() -> Iterator[Rooms]:
 
 
 def settled(call: Callable[[], T]) -> T:
-    """The result of ``call``, repeated where a rendering inside had too little room.
+    """Return ``call()``, repeated until every rendering inside had enough capacity.
 
-    The host waits once for all renderings inside, and not at all without any. A repeated call has
-    enough room for what was seen.
+    Takes one device-to-host synchronisation per call, none without renderings. A repeated call has
+    the capacity that the last one needed.
 
     Args:
-        call: anything that renders; it may be called several times. Inside :func:`deferred` it is
-            called once and not checked.
+        call: renders, any number of times, and may be called repeatedly. Inside :func:`deferred` it
+            is called once and not checked.
     """
     if _rooms.get() is not None:
         return call()
@@ -118,17 +110,17 @@ def with_room(
     find: Callable[[int], tuple[T, Tensor]],
     draw: Callable[[T], Drawn],
 ) -> Drawn:
-    """What is drawn with enough room.
+    """Find and render intersections with enough capacity.
 
     Args:
         grid: tiles of an image (rows, columns).
-        splats: number of all images together, at least 1.
-        find: finds intersections in a capacity, and gives them and the number that is needed.
-        draw: draws intersections.
+        splats: number of splats of all images together, at least 1.
+        find: finds intersections, given a capacity; returns them and the number needed.
+        draw: renders intersections.
 
     Returns:
-        What ``draw`` returned last. Inside :func:`deferred` it may lack splats: the caller
-        checks the rooms.
+        The last result of ``draw``. Inside :func:`deferred` it may lack splats: the caller checks
+        the capacities.
     """
     rooms = _rooms.get()
     while True:
@@ -145,7 +137,7 @@ def with_room(
 
 
 class Coming:
-    """A number on its way to the host, which can go on until it reads it.
+    """Asynchronous copy of a scalar to the host, which waits for it only on reading.
 
     Args:
         value: a scalar on any device.
@@ -161,7 +153,7 @@ class Coming:
             self.arrived.record(torch.cuda.current_stream(value.device))
 
     def read(self) -> int:
-        """The number; waits for what the device was asked before it was made, and no longer."""
+        """Return the number; waits only for work that was queued before its copy."""
         if self.arrived is not None:
             self.arrived.synchronize()
         return int(self.value)

@@ -1,7 +1,7 @@
 """The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat.
 
-Its kernels project and draw. What lies between them, finding the splats of each tile, makes the
-host wait in gsplat, and is done here (:mod:`ghgs_lit.ops.intersections`)."""
+gsplat's kernels project and rasterize. The step in between, finding the splats of each tile, is done
+by :mod:`ghgs_lit.ops.intersections`, since gsplat's own causes a device-to-host synchronisation."""
 
 import importlib
 import warnings
@@ -19,25 +19,25 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: The limit of alpha that is compiled into gsplat.
 _ALPHA_MAX = RasterSettings().alpha_max
-#: Threads of a warp. In a batch, gsplat 1.5.3 sums the gradients of a warp by the index of a
-#: Gaussian in its element alone, and would mix those of elements with fewer Gaussians than this.
+#: Threads of a warp. In a batch, gsplat 1.5.3 sums gradients within a warp by a Gaussian's index in
+#: its element, which would mix elements with fewer Gaussians than this.
 _WARP = 32
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
-#: Versions whose kernels are known to draw the intersections that are found here.
+#: Versions whose kernels are known to accept these intersections.
 _KNOWN = ("1.5.3",)
-#: Channels, with depth, up to which gsplat draws all at once.
+#: Largest number of channels, with depth, that gsplat rasterizes in one pass.
 _CHANNELS = 32
 
 
 class BackendUnavailable(InputError):
-    """The chosen renderer cannot run on this machine; the message says what was tried."""
+    """The chosen renderer cannot run on this machine; the message gives the reason."""
 
 
 def load() -> Any:
-    """The package gsplat.
+    """Import gsplat.
 
     Raises:
-        BackendUnavailable: no CUDA device, or the import fails.
+        BackendUnavailable: there is no CUDA device, or the import fails.
     """
     if not torch.cuda.is_available():
         raise BackendUnavailable(
@@ -49,7 +49,7 @@ def load() -> Any:
         gsplat.rasterization  # noqa: B018
         return gsplat
     except Exception as error:
-        # Building gsplat's kernels can fail in many ways; the message repeats the reason.
+        # gsplat compiles its kernels on import, which fails in many ways.
         reason = str(error).strip().splitlines()
         raise BackendUnavailable(
             f"renderer.backend=gsplat: `import gsplat` failed with {type(error).__name__}: "
@@ -71,14 +71,14 @@ def rasterize(
         gaussians: on a CUDA device, in metres.
         cameras: [B, T] on the same device, in metres.
         settings: constants of the image; those in :data:`_FIXED` are compiled into gsplat.
-        near: metres; least depth of a centre that is drawn.
-        far: metres; greatest depth of a centre that is drawn.
+        near: near plane in metres.
+        far: far plane in metres.
 
     Returns:
         Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
 
     Raises:
-        InputError: settings that gsplat's kernels do not offer.
+        InputError: settings that gsplat's kernels do not support.
         BackendUnavailable: gsplat cannot run on this machine.
     """
     default = RasterSettings()
@@ -92,7 +92,7 @@ def rasterize(
     gsplat = load()
     channels = gaussians.colors.shape[1]
     if len(gaussians) == 0 or 0 in cameras.shape:
-        # Part of the graph, so that a batch of empty elements can be differentiated.
+        # Part of the autograd graph, so that a batch of empty elements can be differentiated.
         nothing = (gaussians.means.sum() + gaussians.colors.sum()).float()
         drawn = nothing * nothing.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
     else:
@@ -104,16 +104,8 @@ def rasterize(
 def _drawn(
     gsplat: Any, gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Tensor:
-    """Colours, expected depth and alpha of all views, [B, T, C + 2, h, w].
-
-    Args:
-        gsplat: the package, from :func:`load`.
-        gaussians: at least one, in metres.
-        cameras: [B, T], not empty, in metres.
-        settings: constants of the image.
-        near: metres; least depth of a centre that is drawn.
-        far: metres; greatest depth of a centre that is drawn.
-    """
+    """Render colours, expected depth and alpha [B, T, C + 2, h, w] of at least one Gaussian and one
+    camera."""
     fields = _sanitized(*_side_by_side(gaussians))
     means, quaternions, scales, opacities, colors = fields
     if settings.alpha_max < _ALPHA_MAX:
@@ -144,7 +136,7 @@ def _drawn(
 
 @cache
 def _is_known(gsplat: Any) -> bool:
-    """Whether gsplat's kernels can be called one by one; said once where they are unknown."""
+    """Whether gsplat's kernels can be called one by one; warns once for unknown versions."""
     version = getattr(gsplat, "__version__", "unknown")
     known = version in _KNOWN
     if not known:
@@ -159,13 +151,13 @@ def _is_known(gsplat: Any) -> bool:
 def _without_wait(
     gsplat: Any, seen: dict[str, Any], colors: Tensor, antialiased: bool
 ) -> tuple[Tensor, Tensor]:
-    """What gsplat's ``rasterization`` draws, without its wait of the host.
+    """gsplat's ``rasterization`` without its device-to-host synchronisation.
 
     Args:
         gsplat: the package, of a version in :data:`_KNOWN`.
-        seen: Gaussians and cameras, by the names of gsplat's ``fully_fused_projection``.
+        seen: Gaussians and cameras, arguments of gsplat's ``fully_fused_projection``.
         colors: [B, N, C].
-        antialiased: scale opacities by gsplat's compensations.
+        antialiased: whether to multiply opacities by gsplat's compensations.
 
     Returns:
         Colours and expected depth [B, T, h, w, C + 1], and alpha [B, T, h, w, 1].
@@ -196,9 +188,8 @@ def _without_wait(
 
 
 def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
-    """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in
-    float32; padded to one number, at least :data:`_WARP` with several elements, by Gaussians
-    with opacity 0."""
+    """Pad Gaussians to [B, N, ...] in float32 with ones of opacity 0, to at least :data:`_WARP` if
+    there are several elements; returns means, quaternions, scales, opacities and colours."""
     names = ("means", "quaternions", "scales", "opacities", "colors")
     fields = [getattr(gaussians, name).float() for name in names]
     if len(gaussians.splits) == 1:
@@ -214,22 +205,11 @@ def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
 def _sanitized(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> tuple[Tensor, ...]:
-    """Gaussians that gsplat draws as the other backends do.
+    """Replace values that gsplat would treat unlike the other backends.
 
-    gsplat squares quaternions in float32 and does not expect NaN or infinity. So quaternions are
-    normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity
-    is not finite becomes invisible.
-
-    Args:
-        means: [B, N, 3].
-        quaternions: wxyz of any length, [B, N, 4].
-        scales: standard deviations, [B, N, 3].
-        opacities: [B, N].
-        colors: [B, N, C]; returned unchanged.
-
-    Returns:
-        All five, in the order of the arguments.
-    """
+    gsplat squares quaternions in float32 and does not handle NaN or infinity. So quaternions are
+    normalised, the zero quaternion becomes the identity, and Gaussians whose geometry or opacity is
+    not finite become invisible. Returns all five arguments, in order."""
     geometry = torch.cat((means, quaternions, scales, opacities[..., None]), dim=-1)
     is_finite = geometry.isfinite().all(-1)
     identity = torch.nn.functional.pad(means.new_ones(1), (0, 3))

@@ -1,5 +1,6 @@
-"""The reference renderer for tests, in plain PyTorch and the dtype of its input. It evaluates every
-Gaussian in every pixel, so it is slow and needs much memory; gradients are by autograd.
+"""Reference renderer in plain PyTorch, in the dtype of its input, with gradients by autograd.
+
+Evaluates every Gaussian at every pixel, so it is slow and needs much memory: for tests.
 :class:`ghgs_lit.ops.rasterization.settings.RasterSettings` defines the image."""
 
 import math
@@ -14,14 +15,13 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
-# Gaussians times pixels in memory at once.
+# Largest number of Gaussians times pixels in memory at once.
 _CHUNK = 1 << 19
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians projected into one camera: centres in pixels,
-    covariances as (xx, xy, yy) in px^2."""
+    """Gaussians projected into one camera: centres in pixels, covariances (xx, xy, yy) in px^2."""
 
     centers: Float[Tensor, "n 2"]
     covariances: Float[Tensor, "n 3"]
@@ -40,8 +40,8 @@ def rasterize(
         gaussians: of B elements, in float32 or float64.
         cameras: [B, T], in the dtype of the means.
         settings: constants of the image.
-        near: least depth of a centre that is drawn, in the unit of the means.
-        far: greatest depth of a centre that is drawn.
+        near: near plane, in the unit of the means.
+        far: far plane, in the unit of the means.
 
     Returns:
         Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w], in the dtype of the means;
@@ -61,15 +61,8 @@ def rasterize(
 def _view(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Float[Tensor, "channels h w"]:
-    """Sums over the Gaussians that a pixel sees of ``w colour`` (C channels), ``w z`` and ``w``.
-
-    Args:
-        gaussians: of one element.
-        camera: one camera, without batch dimensions.
-        settings: constants of the image.
-        near: least depth of a centre that is drawn.
-        far: greatest depth of a centre that is drawn.
-    """
+    """Sums over the Gaussians visible in each pixel of ``w colour`` (C channels), ``w z`` and ``w``,
+    for one element and one camera without batch dimensions."""
     index = visible(gaussians, camera, settings, near, far)
     splats = project(gaussians.select(index, (len(index),)), camera, settings)
     centers = pixel_centers(camera.height, camera.width, splats.centers).flatten(0, 1)
@@ -82,17 +75,17 @@ def _view(
 def visible(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Int[Tensor, " n"]:
-    """Indices of the Gaussians to draw, sorted by float32 depth, ties by index.
+    """Indices of the visible Gaussians, sorted by float32 depth, ties by index.
 
-    Drawn are Gaussians with a finite centre, a positive, finite determinant and an opacity of at
-    least ``alpha_min``.
+    A Gaussian is visible if its centre is finite and between ``near`` and ``far``, its determinant
+    positive and finite, and its opacity at least ``alpha_min``.
 
     Args:
         gaussians: of one element.
         camera: one camera, without batch dimensions.
         settings: constants of the image.
-        near: least depth of a centre that is drawn, in the unit of the means.
-        far: greatest depth of a centre that is drawn.
+        near: near plane, in the unit of the means.
+        far: far plane, in the unit of the means.
     """
     splats = project(gaussians, camera, settings)
     depths = splats.depths
@@ -104,16 +97,11 @@ def visible(
 
 
 def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> Splats:
-    """All Gaussians as splats of one camera, also those that it does not see.
+    """Project all n Gaussians of an element into one camera, visible or not.
 
-    The covariance is that of EWA splatting (Zwicker et al. 2001), ``J W Sigma W^T J^T`` plus
-    ``low_pass`` on its diagonal, with the Jacobian J at a centre clamped to the frame and
+    The covariance is that of EWA splatting (Zwicker et al., 2001), ``J W Sigma W^T J^T`` plus
+    ``low_pass`` on its diagonal, with the Jacobian J at the centre, clamped to the frame plus
     ``frustum_margin``.
-
-    Args:
-        gaussians: n of one element.
-        camera: one camera, without batch dimensions.
-        settings: constants of the image.
     """
     rotation = camera.extrinsics[:3, :3]
     translation = camera.extrinsics[:3, 3]
@@ -136,7 +124,7 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
     xx = (row_x * row_x).sum(-1)
     xy = (row_x * row_y).sum(-1)
     yy = (row_y * row_y).sum(-1)
-    # |row_x x row_y|^2 = xx yy - xy^2 without the cancellation.
+    # |row_x x row_y|^2 = xx yy - xy^2 without cancellation.
     bare = torch.linalg.cross(row_x, row_y).square().sum(-1)
     determinant = bare + settings.low_pass * (xx + yy) + settings.low_pass**2
     opacities = gaussians.opacities
@@ -150,32 +138,22 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
 
 
 def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSettings) -> Float[Tensor, "P c"]:
-    """Composite all splats over ``P`` pixels; see :func:`_view`.
-
-    Args:
-        splats: n, front to back.
-        pixels: centres of pixels (x, y), in pixels.
-        settings: constants of the image.
-
-    Returns:
-        C sums of colours, then those of ``w z`` and ``w``, for each pixel.
-    """
+    """Composite splats, sorted front to back, at P pixel centres; returns the sums of :func:`_view`."""
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, _ = splats.covariances[:, None].unbind(-1)
     sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats.determinants[:, None])
     near_enough = sigma <= 0.5 * settings.extent**2
     raw = splats.opacities[:, None] * torch.exp(-torch.where(near_enough, sigma, 0))
-    # A clamped alpha has no gradient, also at equality.
+    # A clamped alpha has no gradient, not even at equality.
     alpha = torch.where(raw < settings.alpha_max, raw, settings.alpha_max)
     hit = near_enough & (alpha >= settings.alpha_min)
     behind = torch.log1p(-torch.where(hit, alpha, 0)).cumsum(0)
-    # Transmittance only falls: all splats after the first one that is left out are left out, too.
+    # Transmittance only decreases, so all splats after the first skipped one are skipped, too.
     seen = hit & (behind > (math.log(settings.stop) if settings.stop > 0 else -math.inf))
     alpha = torch.where(seen, alpha, 0)
     step = torch.log1p(-alpha)
     weights = alpha * torch.exp(step.cumsum(0) - step)
     ones = torch.ones_like(splats.depths)
     values = torch.cat((splats.colors, splats.depths[:, None], ones[:, None]), dim=-1)
-    # Not a matrix product: colours that are not finite must not reach pixels that do not
-    # see their splat.
+    # Not a matrix product: colours that are not finite must not reach pixels outside their splat.
     return (weights[..., None] * torch.where(seen[..., None], values[:, None], 0)).sum(0)
