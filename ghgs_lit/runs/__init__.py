@@ -1,1 +1,1 @@
-"""Runs and sweeps: planning, training once, resuming, results and their provenance."""
+"""Runs and sweeps: planning, locking, resuming, results and their provenance."""

@@ -1,4 +1,4 @@
-"""Jobs that train: lock a run that is free and not done, then train or resume it."""
+"""Training jobs: lock a run that is free and unfinished, then train or resume it."""
 
 import time
 from collections.abc import Callable
@@ -24,30 +24,33 @@ if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training
     from ghgs_lit.cli.verbs import Train as TrainVerb
 
-BUSY = "busy"  #: Return value of a job whose run another process works on
-_PATIENCE = 300.0  # seconds in which the first of several processes begins
-_TASK = "hydra.overrides.task"  # key of the overrides of a sweep's command
+BUSY = "busy"  #: Return value of a job whose run is locked by another process
+_PATIENCE = 300.0  # seconds to wait for the first of several processes to begin
+_TASK = "hydra.overrides.task"  # key of a sweep's command-line overrides in its multirun.yaml
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 
 Train = Callable[[Run, Path, dict[str, Any]], float | None]
-"""``(run, directory, stats) -> metric``; ``stats`` is filled for ``sessions.jsonl``."""
+"""Function ``(run, directory, stats) -> metric``; it fills ``stats`` for ``sessions.jsonl``."""
 
 
 def in_sweep() -> bool:
-    """Whether Hydra launched this job as one of several."""
+    """Whether Hydra launched this job as part of a multirun."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def _waits() -> bool:
-    """Whether to wait for a locked run: the grid sweeper returns to it later,
-    others need its result now."""
+    """Whether to wait for a locked run: the grid sweeper retries it later, other sweepers need its result
+    now."""
     return in_sweep() and HydraConfig.get().sweeper.get("_target_") != SWEEPER
 
 
 def register_resolvers() -> None:
-    """Register resolvers of configurations: ``${config_hash:}``, the name of a run's directory;
-    ``${run_of_job:name}``, the name of a directory that a job of SLURM goes on in, else ``name``;
-    ``${folder:first,second}``, the second if the first is null."""
+    """Register the resolvers used in configurations.
+
+    - ``${config_hash:}``: name of a run's directory.
+    - ``${run_of_job:name}``: the directory that a requeued SLURM job continues in; otherwise ``name``.
+    - ``${folder:first,second}``: ``first``, or ``second`` if it is null.
+    """
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
@@ -78,19 +81,20 @@ def register_resolvers() -> None:
 
 
 def train_once(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
-    """Train a run from where it stands, in the process that locks it.
+    """Train a run, resuming it where it stands, in the process that locks it.
 
     Args:
-        directory: Of the run.
-        run: Its configuration.
-        train: Trains and measures; returns the metric.
+        directory: Directory of the run.
+        run: Configuration of the run.
+        train: Trains and evaluates; returns the metric.
 
     Returns:
-        The metric, also of a run that is done; ``BUSY``: in a sweep, another process works on it.
+        The metric, also of a run that had finished before; in a sweep ``BUSY`` if another process has
+        locked the run.
 
     Raises:
-        InputError: Outside of a sweep, another process works on it; its directory holds another run
-            or other files.
+        InputError: Outside a sweep, another process has locked the run; or the directory holds another
+            run or foreign files.
     """
     directory = directory.of(run)
     path = directory.path
@@ -110,18 +114,18 @@ def train_once(directory: RunDirectory, run: "Training", train: Train) -> float 
 
 
 def train_beside(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
-    """Train a run as one of several processes, the first of which is in :func:`train_once`.
+    """Train a run in a further process of a training whose first process is in :func:`train_once`.
 
     Args:
-        directory: Of the run.
-        run: Its configuration.
-        train: Trains and measures; returns the metric.
+        directory: Directory of the run.
+        run: Configuration of the run.
+        train: Trains and evaluates; returns the metric.
 
     Returns:
-        What ``train`` returns, or the metric of a run that is done.
+        The result of ``train``, or the metric of a run that had finished before.
 
     Raises:
-        InputError: There is no first process.
+        InputError: No first process has begun within 300 s.
     """
     directory = directory.of(run)
     end = time.monotonic() + _PATIENCE
@@ -135,14 +139,14 @@ def train_beside(directory: RunDirectory, run: "Training", train: Train) -> floa
 
 
 def check_launcher(run: Run, launcher: str) -> None:
-    """Check that a job of a sweep can train in several processes, which only SLURM starts.
+    """Check that a sweep's launcher can start as many processes as a run trains with.
 
     Args:
-        run: With the group ``trainer``.
+        run: A run with the group ``trainer``.
         launcher: Chosen option of ``hydra/launcher``.
 
     Raises:
-        InputError: The launcher starts one process, the training wants several.
+        InputError: The training requires several processes, which only SLURM launchers start.
     """
     fits = "slurm" in launcher or process_count(run.trainer) == 1
     expected = "1 in a sweep, or hydra/launcher=slurm, which starts processes"
@@ -152,15 +156,12 @@ def check_launcher(run: Run, launcher: str) -> None:
 def check_config(run: "TrainVerb") -> None:
     """Check that a run can train.
 
-    Args:
-        run: Its configuration.
-
     Raises:
-        InputError: It has a frozen encoder without weights.
+        InputError: A frozen encoder, or the semantic branch, has no weights.
     """
     if run.init_from is not None or run.resume not in (None, AUTO) or run.allow_random_encoder:
         return
-    if getattr(run.encoder, "semantic", None) is not None:  # a plug-in's may have none
+    if getattr(run.encoder, "semantic", None) is not None:  # encoders of plug-ins may lack it
         raise InputError(
             "init_from: expected a checkpoint of `ghgs pretext` for encoder.semantic, which does not learn in"
             " training; found none: it would stay random (allow_random_encoder=true to try things out)"

@@ -1,4 +1,4 @@
-"""The plan of a sweep: its runs with their states, what they need, and how long they train."""
+"""Plan of a sweep: its runs with their states, what they require and their expected training time."""
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
@@ -21,14 +21,14 @@ OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl,
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a sweep.
+    """One run of a sweep.
 
     Attributes:
         name: Hash of its configuration.
-        overrides: Of the job, with its directory.
+        overrides: Hydra overrides of the job, including those that set its directory.
         shown: Overrides to print.
-        run: Its configuration.
-        directory: Of the run.
+        run: Configuration of the run.
+        directory: Directory of the run.
     """
 
     name: str
@@ -43,8 +43,8 @@ class Rehearsal:
     """Result of the checks of a dry run.
 
     Attributes:
-        reasons: Why runs would be rejected.
-        notes: What else a user should know.
+        reasons: Why runs would be rejected, one line each.
+        notes: Further information for the user, one line each.
     """
 
     reasons: Sequence[str] = ()
@@ -59,8 +59,8 @@ def shared_overrides(planned: Sequence[PlannedRun]) -> set[str]:
 
 
 def step_seconds(directory: Path) -> tuple[float, int] | None:
-    """Mean seconds of a training step of a sweep's finished runs, and their number; None: none has
-    finished."""
+    """Mean seconds per training step over the finished runs of a sweep, and the number of these runs;
+    None if no run has finished."""
     steps = seconds = count = 0
     for path in directory.rglob("metrics.json"):
         sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
@@ -71,8 +71,7 @@ def step_seconds(directory: Path) -> tuple[float, int] | None:
 
 
 def time_budget(trainer: "TrainerOptions") -> float | None:
-    """Seconds of ``trainer.max_time``, which is ``days:hours:minutes:seconds`` or a mapping; None: no
-    limit."""
+    """Seconds of ``trainer.max_time`` (``days:hours:minutes:seconds`` or a mapping); None: no limit."""
     value = trainer.max_time
     if isinstance(value, str):
         value = dict(zip(("days", "hours", "minutes", "seconds"), map(int, value.split(":")), strict=True))
@@ -82,7 +81,7 @@ def time_budget(trainer: "TrainerOptions") -> float | None:
 def print_states(
     planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]], end: str = ""
 ) -> list[State]:
-    """Print a table of the runs and the number of runs in each state."""
+    """Print a table of the runs, with further ``columns``, and the number of runs in each state."""
     shared = shared_overrides(planned)
     states = [item.directory.state for item in planned]
     overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
@@ -94,13 +93,13 @@ def print_states(
 
 
 def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
-    """Print the runs with their states, the training time of the remaining ones, the output paths
-    and what is missing.
+    """Print the runs with their states, the expected training time of the remaining ones, the output
+    paths and everything that is missing.
 
     Args:
         planned: All runs of the sweep.
-        directory: Of the sweep.
-        rehearse: Checks what the runs need that are not done.
+        directory: Directory of the sweep.
+        rehearse: Checks the prerequisites of the unfinished runs.
 
     Raises:
         InputError: Something is missing.
@@ -138,7 +137,7 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
 
 
 def _unreadable(planned: Sequence[PlannedRun], states: Sequence[State]) -> list[str]:
-    """What is wrong with checkpoints that runs would resume, a line each."""
+    """One line for each checkpoint that a run would resume from but that cannot be read."""
     from ghgs_lit.weights.checkpoint import read_checkpoint  # here: it imports PyTorch
 
     lines = []

@@ -1,5 +1,5 @@
-"""The processes of a training: how many there are, which one this is, the SLURM job that they are in,
-and the signals that stop them (exit code 128 + their number)."""
+"""Processes of a training: their number, the rank of this one, its SLURM job, and the signals that stop
+it (exit code 128 + signal number)."""
 
 import contextlib
 import os
@@ -14,20 +14,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ghgs_lit.training.trainer import TrainerOptions
 
-#: Variables that number the processes of a training;
-#: shells of jobs and of crashed launchers keep them.
+#: Environment variables with the rank of a process; they may be left over in shells of batch jobs and of
+#: crashed launchers.
 _RANKS = ("RANK", "LOCAL_RANK")
 
 
 def process_count(trainer: "TrainerOptions") -> int:
-    """Number of processes that train: one for each device of each machine.
-
-    Args:
-        trainer: Its options.
-
-    Returns:
-        At least 1.
-    """
+    """Number of processes that train, at least 1: one per device of each machine."""
     devices = trainer.devices
     if isinstance(devices, tuple):
         count = len(devices)
@@ -41,20 +34,19 @@ def process_count(trainer: "TrainerOptions") -> int:
 def _device_count(accelerator: str) -> int:
     if accelerator == "cpu":
         return 1
-    import torch  # here: plans of sweeps need none
+    import torch  # here: planning a sweep does not need PyTorch
 
     return max(1, torch.cuda.device_count())
 
 
 def settle_rank(trainer: "TrainerOptions") -> int:
-    """Rank of this process among those of its training. Variables of the environment count only where
-    a launcher has started several processes; elsewhere they are left over, and are removed.
+    """Determine the rank of this process within its training.
 
-    Args:
-        trainer: Its options.
+    Environment variables count only where a launcher has started several processes; otherwise they are
+    left over and are removed.
 
     Returns:
-        The rank; 0: the first, or the only one.
+        The rank; 0 for the first or only process.
     """
     from lightning.pytorch.utilities import rank_zero_only  # here: it imports PyTorch
 
@@ -67,15 +59,15 @@ def settle_rank(trainer: "TrainerOptions") -> int:
 
 
 def in_srun() -> bool:
-    """Whether ``srun`` has started this process as a task of a batch job."""
+    """Whether ``srun`` started this process as a task of a batch job."""
     starters = ("SLURM_STEP_ID", "SRUN_DEBUG")
     is_task = "SLURM_NTASKS" in os.environ and any(name in os.environ for name in starters)
     return is_task and os.environ.get("SLURM_JOB_NAME") not in ("bash", "interactive")
 
 
 def launch() -> str | None:
-    """Name of all processes that were started together: the job's step or torchrun's name, and how
-    often it was started again; None: there is no launcher."""
+    """Identifier shared by all processes that were started together: the job step or torchrun's run ID,
+    with the number of restarts; None without a launcher."""
     names = {
         "TORCHELASTIC_RUN_ID": ("TORCHELASTIC_RUN_ID", "TORCHELASTIC_RESTART_COUNT"),
         "SLURM_STEP_ID": ("SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_RESTART_COUNT"),
@@ -87,25 +79,25 @@ def launch() -> str | None:
 
 
 def slurm_job() -> str | None:
-    """Name of the SLURM job, which it keeps when it is queued again; None: outside of SLURM."""
+    """ID of the SLURM job, which is kept when the job is requeued; None outside SLURM."""
     array = os.environ.get("SLURM_ARRAY_JOB_ID")
     task = os.environ.get("SLURM_ARRAY_TASK_ID")
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")
 
 
 def is_queued_again() -> bool:
-    """Whether SLURM has queued the job of this process again, after it had run."""
+    """Whether SLURM has requeued the job of this process."""
     return os.environ.get("SLURM_RESTART_COUNT", "0") != "0"
 
 
 def queue_again(number: int) -> bool:
-    """Queue the SLURM job of a task again that was stopped because its time is up.
+    """Requeue the SLURM job of an ``srun`` task that was stopped at the end of its time limit.
 
     Args:
-        number: Signal that stopped it; SIGUSR1 announces the end of a job's time.
+        number: Signal that stopped the task; only SIGUSR1 announces the end of a job's time.
 
     Returns:
-        Whether the job is queued again.
+        Whether the job was requeued.
     """
     job = slurm_job()
     if number != signal.SIGUSR1 or job is None or not in_srun():
@@ -122,16 +114,16 @@ STOP = (signal.SIGINT, signal.SIGTERM, *ANNOUNCED)
 
 
 class Interrupted(SystemExit):
-    """A signal has stopped this process; the exit code is 128 + its number.
+    """A signal stopped this process; the exit code is 128 + the signal number.
 
-    A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and
-    starts the next one.
+    Derived from ``SystemExit`` because Hydra treats any ``Exception`` as one failed job and starts the
+    next.
 
     Args:
-        number: of the signal.
+        number: Number of the signal.
 
     Attributes:
-        explained: whether the line that says how to go on was printed.
+        explained: Whether the line on how to continue has been printed.
     """
 
     def __init__(self, number: int) -> None:
@@ -141,8 +133,8 @@ class Interrupted(SystemExit):
 
 
 class _Handler:
-    """Signal handler that calls ``act(number)`` only in the process that made it,
-    not in forked workers."""
+    """Signal handler that calls ``act(number)`` only in the process that created it, not in forked
+    workers."""
 
     def __init__(self, act: Callable[[int], Any]) -> None:
         self.act = act
@@ -151,20 +143,17 @@ class _Handler:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() == self.process:
             self.act(number)
-        elif number == signal.SIGTERM:  # sent by a parent to end its workers
+        elif number == signal.SIGTERM:  # sent by a parent process to terminate its workers
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
 
 
-#: Interruptions of the present outermost :func:`interruptible`.
+#: Interruptions received in the current outermost :func:`interruptible`.
 _received: list[Interrupted] = []
 
 
 def interrupt(number: int) -> None:
-    """Raise :class:`Interrupted`.
-
-    Args:
-        number: Of the signal.
+    """Raise :class:`Interrupted` for a signal number.
 
     Raises:
         Interrupted: Always.
@@ -174,31 +163,33 @@ def interrupt(number: int) -> None:
 
 
 def stop_if_interrupted() -> None:
-    """Raise an interruption again that was lost.
+    """Raise an interruption again if it was lost.
 
-    A signal may arrive while a library restores something in a ``finally``: what it raises then
-    hides the interruption, and whoever expects such an error drops both.
+    A signal may arrive while a library restores state in a ``finally`` block: an error raised there hides
+    the interruption, and code that catches this error drops both.
 
     Raises:
-        Interrupted: A signal has arrived in the present :func:`interruptible`.
+        Interrupted: A signal has arrived in the current :func:`interruptible`.
     """
     if _received:
         raise _received[-1]
 
 
 def handlers() -> dict[int, Any]:
-    """Present handlers of these signals, without those that were not set from Python."""
+    """Current handlers of the signals :data:`STOP`, except those not installed from Python."""
     present = {number: signal.getsignal(number) for number in STOP}
     return {number: handler for number, handler in present.items() if handler is not None}
 
 
 def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
-    """Let a function handle signals, except those that others handle and that do not announce an
-    end: under submitit SIGTERM does not end a job.
+    """Install a signal handler, in the main thread only.
+
+    Handlers of other code stay unless their signal announces the end of a job's time (:data:`ANNOUNCED`):
+    under submitit, for example, SIGTERM does not end a job.
 
     Args:
-        act: Gets the number of the signal.
-        before: Handlers by signal, as of :func:`handlers`.
+        act: Called with the signal number.
+        before: Previous handlers by signal, see :func:`handlers`.
     """
     if threading.current_thread() is not threading.main_thread():
         return  # signals belong to the main thread
@@ -213,9 +204,12 @@ def _is_free(handler: Any) -> bool:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise :class:`Interrupted` on the signals :data:`STOP` unless others handle them; where it is
-    lost (:func:`stop_if_interrupted`), once more at the end of the block. Handlers of others for an
-    announced end, as submitit's, which queues the job again, are called at the end of the block."""
+    """Raise :class:`Interrupted` on the signals :data:`STOP` unless other code handles them.
+
+    An interruption that was lost (:func:`stop_if_interrupted`) is raised again at the end of the block.
+    Other code's handlers of announced ends, such as submitit's, which requeues the job, are called at the
+    end of the block.
+    """
     before = handlers()
     is_outermost = not any(isinstance(handler, _Handler) for handler in before.values())
     handle(interrupt, before)
@@ -237,20 +231,20 @@ def interruptible() -> Iterator[None]:
 
 
 def _pass_on(number: int, handler: Any) -> None:
-    """Call the handler that others have set for a signal, if any."""
+    """Call another library's handler of a signal, if there is one."""
     if not _is_free(handler):
-        # The program that queues a job again may be ended with it before it returns.
+        # The command that requeues a job may be killed together with the job before it returns.
         with contextlib.suppress(subprocess.CalledProcessError):
             handler(number, None)
 
 
 def print_how_to_go_on(stop: Interrupted, what: str, how: str, is_queued: bool) -> None:
-    """Print to stderr what was stopped, and how it goes on.
+    """Print to stderr what was stopped and how to continue, and mark the interruption as explained.
 
     Args:
-        stop: The interruption; it counts as explained from then on.
+        stop: The interruption.
         what: What was stopped.
-        how: Which command goes on.
+        how: How to continue it, in words; replaced if SLURM has requeued the job.
         is_queued: Whether SLURM will run it again.
     """
     stop.explained = True

@@ -1,4 +1,4 @@
-"""Progress of long tasks: a bar on a terminal, else a line every minute."""
+"""Progress of long tasks: a bar on a terminal, otherwise one line per minute."""
 
 import datetime
 import time
@@ -11,21 +11,21 @@ from rich.progress import track as bar
 
 T = TypeVar("T")
 
-EVERY = 60.0  #: Seconds between two lines
+EVERY = 60.0  #: Seconds between two progress lines
 
 
 def on_terminal() -> bool:
-    """Whether the output is a terminal."""
+    """Whether standard output is a terminal."""
     return Console().is_terminal
 
 
 class Lines:
-    """Progress lines, appended to a file and printed (unless there is a bar).
+    """Progress lines, appended to a file and printed.
 
     Args:
-        log: file that lines are appended to; None: none.
-        every: seconds between two lines.
-        printed: whether lines are printed.
+        log: File to append lines to; None: no file.
+        every: Seconds between two lines.
+        printed: Whether to print lines; False where a bar is shown.
     """
 
     def __init__(self, log: Path | None = None, every: float = EVERY, printed: bool = True) -> None:
@@ -35,7 +35,7 @@ class Lines:
         self._next = time.monotonic()
 
     def due(self) -> bool:
-        """Whether a line is due: at the first call, then after ``every`` seconds each."""
+        """Whether to write a line now: True at the first call, then once every ``every`` seconds."""
         now = time.monotonic()
         if now < self._next:
             return False
@@ -43,10 +43,10 @@ class Lines:
         return True
 
     def write(self, text: str) -> None:
-        """Write one line with the time of day.
+        """Write one line that starts with the time of day.
 
         Args:
-            text: Without the end of the line.
+            text: Line without its newline.
         """
         line = f"{datetime.datetime.now():%H:%M:%S} {text}"
         if self.printed:
@@ -57,24 +57,16 @@ class Lines:
 
 
 def clock(seconds: float) -> str:
-    """A duration for people.
-
-    Args:
-        seconds: Rounded to whole ones.
-
-    Returns:
-        Text such as ``1:02:03``.
-    """
+    """Format a duration, rounded to whole seconds, as ``h:mm:ss``, such as ``1:02:03``."""
     return str(datetime.timedelta(seconds=round(seconds)))
 
 
 def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
-    """Yield items with a bar on a terminal, elsewhere with a line now and then that
-    counts those done.
+    """Yield items while reporting progress: a bar on a terminal, otherwise a line with the count.
 
     Args:
-        items: Whatever is worked on.
-        text: What is done with them.
+        items: Any iterable; the total is reported if it has a length.
+        text: Description of the task.
         every: Seconds between two lines.
 
     Yields:

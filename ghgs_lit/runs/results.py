@@ -1,5 +1,5 @@
-"""``metrics.json`` and ``metrics.csv``: one row for each subject, target and method, with their
-provenance: configuration, code, versions, machine."""
+"""Results of a run: ``metrics.json`` and ``metrics.csv``, with one row per subject, target and method,
+and their provenance (configuration, code, versions, machine)."""
 
 import csv
 import datetime
@@ -23,10 +23,10 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.parsing import read_json
 
-FORMAT_VERSION = 3  #: The version that is written, and the only one that is read
-METHOD = "model"  #: Method of a trained model's rows; others are baselines
+FORMAT_VERSION = 3  #: Version written, and the only one accepted when reading
+METHOD = "model"  #: ``method`` of rows of a trained model; other values are baselines
 KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
-"""What a row describes; all other entries of a row are metrics."""
+"""Keys that identify a row; all other entries of a row are metrics."""
 
 PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy", "scipy", "gsplat")
 Row = dict[str, Any]
@@ -34,40 +34,19 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """Mean of the values that are neither None nor nan.
-
-    Args:
-        values: Numbers or None.
-
-    Returns:
-        The mean; None without any value.
-    """
+    """Mean of the values that are neither None nor NaN; None if there are no such values."""
     known = [v for v in values if v is not None and not math.isnan(v)]
     return sum(known) / len(known) if known else None
 
 
 def metric_names(rows: Sequence[Row]) -> list[str]:
-    """Names of the metrics in rows.
-
-    Args:
-        rows: Of a measurement.
-
-    Returns:
-        Names in order of appearance.
-    """
+    """Names of the metrics in rows, in order of appearance."""
     names = dict.fromkeys(itertools.chain.from_iterable(rows))
     return [name for name in names if name not in KEYS]
 
 
 def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
-    """Rows of each method on each protocol.
-
-    Args:
-        rows: Of a measurement.
-
-    Returns:
-        Rows by (method, views, targets), then by subject.
-    """
+    """Group rows by (method, views, targets), then by subject."""
     groups: dict[tuple, dict[str, list[Row]]] = {}
     for row in rows:
         key = (row["method"], row["views"], row["targets"])
@@ -76,14 +55,12 @@ def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
-    """Means over subjects for each method, number of views and target protocol. A subject's targets
-    are averaged first, so that each subject counts once.
+    """Mean metrics over subjects for each method, number of views and target protocol.
 
-    Args:
-        rows: Of a measurement.
+    Each subject's targets are averaged first, so that every subject has the same weight.
 
     Returns:
-        One row for each, with the number of ``subjects`` and the means.
+        One row per group, with the number of ``subjects`` and the means.
     """
     names = metric_names(rows)
     summary = []
@@ -99,14 +76,7 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
 
 
 def plain(value: Any) -> Any:
-    """A value as plain data for JSON.
-
-    Args:
-        value: Mappings, lists, tuples, texts, numbers.
-
-    Returns:
-        The same with keys of text; infinite numbers and nan become None.
-    """
+    """Convert a value to plain data for JSON: keys become text; infinities and NaN become None."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
@@ -120,9 +90,9 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     """Write ``metrics.csv``, then ``metrics.json``, which marks the run as complete.
 
     Args:
-        directory: Of the run.
-        rows: Of its measurement.
-        provenance: As of :func:`provenance`.
+        directory: Directory of the run.
+        rows: Rows of its evaluation.
+        provenance: See :func:`provenance`.
 
     Returns:
         Path of ``metrics.json``.
@@ -159,7 +129,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
 
 
 class _Mean(BaseModel):
-    """An entry of ``summary``; all further keys are metrics."""
+    """Entry of ``summary``; all further keys are metrics."""
 
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
     __pydantic_extra__: dict[str, float | None]
@@ -183,18 +153,18 @@ class _Results(BaseModel):
 
 
 def validated(model: type[Model], content: Any, where: str) -> Model:
-    """Check content by a pydantic model.
+    """Validate content with a pydantic model.
 
     Args:
-        model: What is expected.
+        model: Class of the model.
         content: Plain data.
-        where: What it is, for messages.
+        where: Name of the content in error messages.
 
     Returns:
-        The content as the model.
+        An instance of the model.
 
     Raises:
-        InputError: Names ``where`` and the first wrong key.
+        InputError: The content is invalid; the message contains ``where`` and the first wrong key.
     """
     try:
         return model.model_validate(content)
@@ -210,15 +180,9 @@ def validated(model: type[Model], content: Any, where: str) -> Model:
 def read_results(path: Path) -> dict[str, Any]:
     """Read a ``metrics.json``.
 
-    Args:
-        path: Of the file.
-
-    Returns:
-        Its content.
-
     Raises:
-        InputError: It is not complete or of another format version, or its configuration does not
-            fit its ``config_hash``.
+        InputError: The file is incomplete, has another format version, or its configuration does not
+            match its ``config_hash``.
     """
     content = read_json(path, "a metrics.json")
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
@@ -235,11 +199,11 @@ def read_results(path: Path) -> dict[str, Any]:
 
 
 def config_hash(config: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFLUENCE) -> str:
-    """Hash of a configuration, whatever the order of its keys.
+    """Hash of a configuration, independent of the order of its keys.
 
     Args:
         config: Plain data.
-        without: Dotted keys that do not count, with those below them.
+        without: Dotted keys to ignore, including all keys below them.
 
     Returns:
         Twelve hexadecimal digits.
@@ -252,12 +216,12 @@ def config_hash(config: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFL
 def differences(
     before: Mapping[str, Any], now: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFLUENCE
 ) -> list[str]:
-    """What differs between configurations.
+    """Differences between two configurations.
 
     Args:
         before: Plain data.
         now: Plain data.
-        without: Dotted keys that do not count, with those below them.
+        without: Dotted keys to ignore, including all keys below them.
 
     Returns:
         Lines ``key: old value -> new value``.
@@ -269,14 +233,7 @@ def differences(
 
 
 def version_of(name: str) -> str | None:
-    """Version of a package.
-
-    Args:
-        name: Of the distribution.
-
-    Returns:
-        The version; None: it is not installed.
-    """
+    """Version of an installed distribution; None if it is not installed."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -284,13 +241,13 @@ def version_of(name: str) -> str | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the installed packages that results depend on."""
+    """Versions of Python and of the installed packages that affect results."""
     installed = {name: version for name in PACKAGES if (version := version_of(name)) is not None}
     return {"python": platform.python_version(), **installed}
 
 
 def git_state() -> dict[str, Any] | None:
-    """Commit of the checkout and whether tracked files were changed; None outside of a checkout."""
+    """Commit of the checkout and whether tracked files have changed; None outside a checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -309,14 +266,14 @@ def git_state() -> dict[str, Any] | None:
 
 
 def provenance(config: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
-    """Where results come from: configuration with its hash, code, versions, machine and time.
+    """Origin of results: configuration with its hash, code, versions, machine and time.
 
     Args:
-        config: The run's full configuration.
-        **facts: Of the verb, such as seed, protocol and seconds.
+        config: Full configuration of the run.
+        **facts: Further entries, such as seed, protocol and seconds.
 
     Returns:
-        Plain data for a results file.
+        Plain data for ``metrics.json``.
     """
     return {
         **facts,

@@ -1,11 +1,10 @@
-"""A run on disk: whose configuration it has, how it goes on, the process that works on it,
-and its sessions.
+"""A run on disk: its identity, how it resumes, the process that holds it, and its sessions.
 
-``run.json`` marks a folder as a run's, with the hash of its configuration; only in such a folder, and
-only by the process that has locked ``.lock``, anything is deleted. A run is done when it has the
-``metrics.json`` of its configuration, which is written last. ``sessions.jsonl`` has a line for the
-start of each process and one for its end, which a killed process lacks. No file names the folder,
-so that a run can be moved.
+``run.json`` marks a folder as a run and contains the hash of its configuration. Files are deleted only in
+such a folder and only by the process that holds the lock ``.lock``. A run is done when ``metrics.json``
+of its configuration exists, which is written last. ``sessions.jsonl`` has one line for the start of each
+process and one for its end, which is missing if the process was killed. No file contains the path of the
+folder, so that a run can be moved.
 """
 
 import contextlib
@@ -42,10 +41,10 @@ from ghgs_lit.runs.results import config_hash, differences, read_results, valida
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training
 
-AUTO = "auto"  #: Value of ``resume``: as the directory stands
+AUTO = "auto"  #: Value of ``resume``: continue the run in the directory, if any
 MARKER = "run.json"
-#: What training writes into a run's directory, apart from checkpoints of other names and Hydra's logs,
-#: and a new run deletes; other files in these folders are a user's.
+#: Files that training writes into a run's directory and that a new run deletes, apart from checkpoints of
+#: other names and Hydra's logs; other files in these folders belong to the user.
 _FILES = (
     "checkpoints/frozen-*.pt",
     "csv/metrics.csv",
@@ -57,8 +56,8 @@ _FILES = (
     "pictures/step_*/*.png",
     "tensorboard/events.out.tfevents.*",
 )
-WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Names in the directory
-_CURVES = "tb"  #: Folder of a sweep with TensorBoard's files of its runs
+WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Their top-level names
+_CURVES = "tb"  #: Folder of a sweep with the TensorBoard files of its runs
 SESSIONS = "sessions.jsonl"
 PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, in the sweep's folder
 
@@ -67,11 +66,11 @@ class Identity(BaseModel):
     """Content of ``run.json``.
 
     Attributes:
-        id: of the run, wherever it is moved, also for loggers elsewhere.
-        config_hash: of the configuration.
-        settings_hash: of the configuration without what may change while it trains.
-        resume: value of ``resume`` that it began with.
-        job: of SLURM, which worked on it last.
+        id: ID of the run, which is kept when the run is moved; external loggers use it, too.
+        config_hash: Hash of the configuration.
+        settings_hash: Hash of the configuration without keys that may change on resuming.
+        resume: Value of ``resume`` that the run began with.
+        job: SLURM job that last worked on the run.
     """
 
     model_config = ConfigDict(strict=True)
@@ -82,19 +81,13 @@ class Identity(BaseModel):
     job: str | None
 
 
-#: File of a run of a grid with the overrides that distinguish it.
+#: File with the overrides that distinguish a run from the other runs of its grid.
 SWEPT = "swept.json"
 
 
 def runs_in_order(sweep: Path) -> list[str]:
-    """Names of the folders of a sweep's runs, those of its last command first.
-
-    Args:
-        sweep: Directory of the sweep.
-
-    Returns:
-        Names in the order in which the commands list them; empty where no file does.
-    """
+    """Folder names of a sweep's runs in the order of its commands, those of the last command first; empty
+    if no file lists them."""
     with contextlib.suppress(InputError, OSError):
         names = lookup(read_yaml(sweep / PLAN), "runs")
         if isinstance(names, list):
@@ -107,8 +100,8 @@ class State(StrEnum):
 
     DONE = "done"
     RUNNING = "running"
-    PARTIAL = "partial"  # resumes from its last checkpoint
-    FAILED = "failed"  # is started again
+    PARTIAL = "partial"  # to resume from its last checkpoint
+    FAILED = "failed"  # to start again
     MISSING = "missing"
 
 
@@ -116,9 +109,9 @@ class RunDirectory:
     """Directory of a run; it need not exist.
 
     Args:
-        path: of the directory.
-        config_hash: results of another configuration are none of this run; None: whatever its
-            configuration is.
+        path: Path of the directory.
+        config_hash: Results of another configuration are ignored; None: accept results of any
+            configuration.
     """
 
     def __init__(self, path: Path, config_hash: str | None = None) -> None:
@@ -128,20 +121,12 @@ class RunDirectory:
         self._is_mine = False
 
     def of(self, run: Run) -> "RunDirectory":
-        """The directory as that of a run.
-
-        Args:
-            run: Its configuration.
-
-        Returns:
-            A directory whose results count only if they are of that configuration.
-        """
+        """Return the same directory, accepting only results of this run's configuration."""
         return RunDirectory(self.path, config_hash(run.plain))
 
     @property
     def results(self) -> dict[str, Any] | None:
-        """Content of ``metrics.json``; None if it is missing,
-        unreadable or of another configuration."""
+        """Content of ``metrics.json``; None if it is missing, unreadable or of another configuration."""
         path = self.path / "metrics.json"
         try:
             results = read_results(path) if path.is_file() else None
@@ -149,7 +134,7 @@ class RunDirectory:
             return None
         if results is None or self.config_hash is None:
             return results
-        # A verb may complete the configuration of its command, whose hash is that of the run.
+        # The hash of a run is that of its command's configuration, which the verb may complete.
         hashes = [lookup(results["provenance"], key) for key in ("config_hash", "run.config_hash")]
         return results if self.config_hash in hashes else None
 
@@ -159,13 +144,13 @@ class RunDirectory:
 
     @property
     def metric(self) -> float | None:
-        """Mean PSNR of the first protocol, by which a sweep compares its runs."""
+        """Mean PSNR of the first protocol, in dB, by which a sweep compares its runs."""
         results = self.results
         return None if results is None else results["summary"][0].get("psnr")
 
     @property
     def checkpoint(self) -> Path | None:
-        """Checkpoint that an interrupted run resumes from."""
+        """Checkpoint from which an interrupted run resumes."""
         path = self.path / "checkpoints" / "last.ckpt"
         return path if path.is_file() else None
 
@@ -182,7 +167,7 @@ class RunDirectory:
 
     @property
     def swept(self) -> list[str]:
-        """Overrides that distinguish a run of a grid from the others; none for a single run."""
+        """Overrides that distinguish a run from the other runs of its grid; empty for a single run."""
         path = self.path / SWEPT
         texts = read_json(path) if path.is_file() else []
         fits = isinstance(texts, list) and all(isinstance(text, str) and text.isprintable() for text in texts)
@@ -191,14 +176,15 @@ class RunDirectory:
 
     @property
     def title(self) -> str:
-        """:attr:`swept` as the name of a folder, without the groups of keys; of a long one the end."""
+        """Folder name made of :attr:`swept`, keys without their groups; limited to the last 200
+        characters."""
         changes = (re.sub(r"^[^=]*\.", "", change) for change in self.swept)
         return ",".join(changes).replace(os.sep, "_")[-200:].lstrip(".")
 
     @property
     def curves(self) -> Path:
-        """Folder of TensorBoard's files, by which TensorBoard names the run: for a run of a grid
-        in the sweep's folder, called :attr:`title`; ``.run`` in it holds the run's id."""
+        """Folder of the TensorBoard files, whose name TensorBoard shows as the run's. For a run of a grid
+        it is named :attr:`title` and lies in the sweep's folder; its file ``.run`` holds the run's ID."""
         if not (self.title and (self.path.parent / PLAN).is_file()):
             return self.path / "tensorboard"
         folder = self.path.parent / _CURVES / self.title
@@ -208,7 +194,7 @@ class RunDirectory:
 
     @property
     def owner(self) -> str:
-        """Process that worked on the run last, for messages."""
+        """Description of the process that last locked the run, for messages."""
         return lock_owner(self._lock)
 
     @contextlib.contextmanager
@@ -216,10 +202,10 @@ class RunDirectory:
         """Lock the run for this process (:func:`ghgs_lit.files.lock`).
 
         Args:
-            wait: Wait for a process that has locked it.
+            wait: Wait while another process holds the lock.
 
         Yields:
-            Whether the run is locked for this process.
+            Whether this process holds the lock.
         """
         with lock(self._lock, wait) as self._is_mine:
             try:
@@ -229,10 +215,10 @@ class RunDirectory:
 
     @property
     def marker(self) -> Identity | None:
-        """Content of ``run.json``; None: the folder is no run's.
+        """Content of ``run.json``; None if the folder does not belong to a run.
 
         Raises:
-            InputError: It is another file.
+            InputError: The file has another format.
         """
         path = self.path / MARKER
         if not path.is_file():
@@ -240,16 +226,16 @@ class RunDirectory:
         return validated(Identity, read_json(path, "a run's identity"), str(path))
 
     def start(self, run: "Training") -> str | None:
-        """The checkpoint that a run starts from in this directory. Nothing is written.
+        """Checkpoint from which a run starts in this directory. Writes nothing.
 
         Args:
-            run: Its configuration; in a new directory the keys of its verb alone are read.
+            run: Configuration of the run; in a new directory only the keys of its verb are read.
 
         Returns:
-            Path of the checkpoint; None: from the first step.
+            Path of the checkpoint; None: start at the first step.
 
         Raises:
-            InputError: What another run wrote is there, or files of somebody else.
+            InputError: The directory holds another run or foreign files.
         """
         require_no_links(self.path, WRITTEN)
         if self.curves.parent != self.path:
@@ -270,15 +256,8 @@ class RunDirectory:
         return given
 
     def goes_on(self, run: "Training") -> bool:
-        """Whether the directory has the run that the same command began; only the length of a run
-        that is not complete, and what is measured after it, may differ.
-
-        Args:
-            run: Configuration of the command.
-
-        Returns:
-            Whether the run goes on.
-        """
+        """Whether the same command began the run in this directory. In an incomplete run, the length of
+        training and the evaluation may differ."""
         marker = self.marker
         if marker is None or run.resume is None or marker.resume != run.resume:
             return False
@@ -311,17 +290,16 @@ class RunDirectory:
         )
 
     def begin(self, run: "Training") -> "Training":
-        """Make the directory that of a run. Where there is no checkpoint to start from, what was
-        written is trained again, and deleted. Call it where the run is claimed.
+        """Turn the directory into that of a run, which this process must have claimed.
 
-        Args:
-            run: Its configuration.
+        Without a checkpoint to start from, previous output is deleted and the run trains from the
+        beginning.
 
         Returns:
-            The run with the checkpoint to start from as ``resume``.
+            The run, with ``resume`` set to the checkpoint to start from.
 
         Raises:
-            InputError: As for :meth:`start`.
+            InputError: See :meth:`start`.
         """
         start = self.start(run)
         marker = self.marker
@@ -342,7 +320,7 @@ class RunDirectory:
         return run.replace(resume=start)
 
     def _clear(self, run: "Training", with_sessions: bool) -> None:
-        """Delete what training wrote; only in a run's folder that this process has claimed."""
+        """Delete the output of training, only in a run's folder that this process has claimed."""
         options = run.plain.get("callbacks", {}).values()
         names = (re.sub(r"\{.*?\}", "*", each["filename"]) for each in options if each and "filename" in each)
         patterns = [*_FILES, *(f"checkpoints/{name}.ckpt" for name in names), *[SESSIONS] * with_sessions]
@@ -355,22 +333,22 @@ class RunDirectory:
         for path in paths:
             path.unlink()
         for folder in {path.parent for path in paths} - {self.path}:
-            with contextlib.suppress(OSError):  # a user's files are in it
+            with contextlib.suppress(OSError):  # it holds files of the user
                 folder.rmdir()
 
     def discard(self, others: Iterable[str], since: float) -> None:
-        """Remove a directory in which nothing was begun: it holds only files of a start, those of a
-        run and ``others``, and no process works in it.
+        """Remove the directory if no run has begun in it: it contains only files written at startup,
+        those of a run and ``others``, and no process holds its lock.
 
         Args:
-            others: Names of further files that may be there.
-            since: Time of the start in seconds; older files are not removed.
+            others: Names of further files that may exist.
+            since: Time of startup in seconds since the epoch; if any file is older, nothing is removed.
         """
         known = {".lock", MARKER, "config.yaml", SESSIONS, *others}
 
         def is_unused() -> bool:
             paths = list(self.path.glob("*"))
-            if not paths:  # made for this start, if it is as new
+            if not paths:  # created at this startup unless it is older
                 return self.path.is_dir() and self.path.stat().st_mtime >= since
             return all(p.name in known and p.lstat().st_mtime >= since for p in paths)
 
@@ -381,7 +359,7 @@ class RunDirectory:
                 shutil.rmtree(self.path, ignore_errors=True)
 
     def sessions(self) -> list[dict[str, Any]]:
-        """An entry for each process that worked on the run; a killed one has no ``outcome``."""
+        """One entry per process that worked on the run; entries of killed processes have no ``outcome``."""
         path = self.path / SESSIONS
         sessions: list[dict[str, Any]] = []
         for entry in read_lines_of_json(path) if path.exists() else ():
@@ -396,7 +374,8 @@ class RunDirectory:
         """Log start and end of this process in ``sessions.jsonl``.
 
         Args:
-            resumed: Checkpoint that it resumed; logged relative to the run if it is its own.
+            resumed: Checkpoint that the process resumed from; logged as a relative path if it lies in the
+                run's directory.
 
         Yields:
             A dict for numbers such as steps and seconds, which are logged at the end.
@@ -415,8 +394,8 @@ class RunDirectory:
         self._log("ended", outcome="done", **stats)
 
     def session_beside(self) -> dict[str, Any] | None:
-        """The present session of the first of the processes that were started together with this
-        one, with the path of the checkpoint that it ``resumed``; None: there is none yet."""
+        """Current session of the first of the processes started together with this one, with the absolute
+        path of the checkpoint that it ``resumed`` from; None if it has not begun."""
         last = (self.sessions() or [{}])[-1]
         if last.get("launch") != launch() or "outcome" in last or not is_locked(self._lock):
             return None
@@ -434,14 +413,11 @@ def _owner_of(curves: Path) -> str | None:
 
 
 def begun_by_job(folder: Path, pattern: str) -> list[RunDirectory]:
-    """Runs that the present job of SLURM has worked on.
+    """Runs on which the current SLURM job has worked; none outside SLURM.
 
     Args:
-        folder: Below which they are.
-        pattern: Of their ``run.json`` below the folder.
-
-    Returns:
-        The runs; none outside of SLURM.
+        folder: Folder that contains the runs.
+        pattern: Glob pattern of their ``run.json`` relative to the folder.
     """
     runs = [RunDirectory(path.parent) for path in folder.glob(pattern)]
     return [run for run in runs if slurm_job() is not None and run.marker.job == slurm_job()]

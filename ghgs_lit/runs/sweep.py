@@ -1,4 +1,4 @@
-"""Sweeps (``hydra/sweeper=grid``): the plan of a grid's runs, and the launch of those that are not done."""
+"""Sweeps (``hydra/sweeper=grid``): plan the runs of a grid and launch the unfinished ones."""
 
 import contextlib
 import json
@@ -38,8 +38,8 @@ from ghgs_lit.runs.results import config_hash, differences
 from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State, runs_in_order
 
 log = logging.getLogger(__name__)
-_POLL = 2.0  # seconds between checks of runs that other processes work on
-#: Words in sbatch's errors, and the keys of the launcher that they are about.
+_POLL = 2.0  # seconds between checks of runs locked by other processes
+#: Words in sbatch's error messages, with the launcher keys that they concern.
 _SBATCH_KEYS = {
     "partition": ("partition",),
     "gres": ("gres", "gpus_per_node", "gpus_per_task"),
@@ -57,19 +57,19 @@ Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
-    """Run the grid of a command, or with ``dry_run`` print its plan.
+    """Run the grid of a command, or print its plan with ``dry_run``.
 
     Args:
-        sweeper: Hydra's, with configuration, launcher and parameters.
+        sweeper: Hydra's sweeper, with configuration, launcher and parameters.
         arguments: Overrides of the command line.
-        rehearse: Checks what runs need, for ``dry_run``.
+        rehearse: Checks the prerequisites of runs, for ``dry_run``.
 
     Returns:
-        What the jobs returned, in the form that Hydra expects.
+        The jobs' return values in the form that Hydra expects.
 
     Raises:
-        InputError: A configuration, a directory or the launcher is rejected; with ``dry_run``
-            something is missing.
+        InputError: A configuration, a directory or the launcher is rejected; with ``dry_run``, something
+            is missing.
         Interrupted: Ctrl-C or SIGTERM; no further run is started.
     """
     config = sweeper.config
@@ -108,10 +108,10 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
 def combinations(
     params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
 ) -> list[list[str]]:
-    """Overrides of each job; values of the command line replace the sweep's own.
+    """Overrides of each job of a grid; values on the command line replace those of the sweep.
 
     Args:
-        params: ``hydra.sweeper.params``: values of keys, separated by commas; None: none.
+        params: ``hydra.sweeper.params``: comma-separated values by key; None: no values.
         arguments: Overrides of the command line.
         loader: Resolves ``glob(*)`` to the options of a group.
 
@@ -127,7 +127,7 @@ def combinations(
 
 
 def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[PlannedRun]:
-    """The distinct runs of a sweep, checked as far as that takes no time; nothing is written."""
+    """Distinct runs of a sweep, after all checks that are fast; writes nothing."""
     config, batch = sweeper.config, sweeper.max_batch_size
     require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     verb = verb_class(sweeper.verb)
@@ -147,7 +147,7 @@ def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> l
         run = verb.of(plain(fill(cfg)))
         run = run.replace(chosen=chosen_options(run.plain, hydra_node))
         name = config_hash(run.plain)
-        # The job writes to the planned directory, whatever number a launcher gives it.
+        # The job writes to the planned directory, whatever job number the launcher assigns.
         places = {"dir": str(directory), "subdir": subdirectory}
         fixed = (f"hydra.sweep.{key}={_quoted(place)}" for key, place in places.items())
         place = RunDirectory(directory / subdirectory, name)
@@ -161,12 +161,12 @@ def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> l
 
 
 def _quoted(text: str) -> str:
-    """``text`` as a value of an override."""
+    """Quote text as the value of an override."""
     return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text) + "'"
 
 
 def _check(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Check launcher and directories, and unless it is a dry run that each run can train."""
+    """Check the launcher and the directories and, unless ``dry_run`` is set, that each run can train."""
     runs: dict[Path, PlannedRun] = {}
     for item in planned:  # an impossible launcher is rejected before anything starts
         check_launcher(item.run, config.hydra.runtime.choices["hydra/launcher"])
@@ -183,13 +183,13 @@ def _check(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -
 
 
 def _print_differing(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print which keys differ if a sweep that none of these runs belongs to is in the directory:
-    someone who means to go on with it has changed a key."""
+    """Print the keys that differ if the directory holds a sweep to which none of these runs belongs: the
+    user has probably changed a key by mistake."""
     if any(item.directory.swept for item in planned):
         return
     others = []
     for path in sorted(directory.glob(f"*/{SWEPT}")):
-        with contextlib.suppress(InputError, OSError):  # a damaged one is not of this sweep
+        with contextlib.suppress(InputError, OSError):  # a damaged run does not belong to this sweep
             others.append(differences(read_yaml(path.with_name("config.yaml")), planned[0].run.plain))
     if keys := min(others, key=len, default=[]):
         shown = ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
@@ -199,13 +199,13 @@ def _print_differing(planned: Sequence[PlannedRun], directory: Path) -> None:
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Write each run's configuration, by which tables list planned runs, and its overrides that the
-    other runs do not have.
+    """Write each run's configuration, from which tables list planned runs, and the overrides that
+    distinguish it from the other runs.
 
     Args:
         planned: All runs of the sweep.
-        config: Configuration of the command, for ``multirun.yaml``, which also lists the runs.
-        directory: Of the sweep.
+        config: Configuration of the command; saved in ``multirun.yaml``, which also lists the runs.
+        directory: Directory of the sweep.
     """
     shared = shared_overrides(planned)
     titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
@@ -218,7 +218,7 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
         swept = [o for o in item.shown if is_hyperparameter(key_of(o))]
         swept = [o for o in swept if key_of(o) == "seed" or o not in shared] or [f"run={item.name}"]
         write_text_atomically(place.path / SWEPT, json.dumps(swept))
-        if place.title in titles:  # of a grid with other settings in the same folder
+        if place.title in titles:  # taken by a grid with other settings in the same folder
             write_text_atomically(place.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
         titles.add(place.title)
     names = dict.fromkeys([*(item.directory.path.name for item in planned), *runs_in_order(directory)])
@@ -227,18 +227,18 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
-    """Launch runs until each one has finished, here or elsewhere, or failed.
+    """Launch runs until each has finished, in any process, or failed.
 
-    A job that returns ``BUSY`` (another process works on its run) is launched again once that
-    process has ended.
+    A job that returns ``BUSY`` (its run is locked by another process) is launched again once that process
+    has ended.
 
     Args:
-        planned: All runs of the sweep; those that are done are not launched.
+        planned: All runs of the sweep; finished runs are not launched.
         launch: Starts jobs, given their overrides and the number of the first.
-        batch: Jobs at once, at least 1; None: all.
+        batch: Number of jobs at once, at least 1; None: all.
 
     Returns:
-        What the jobs returned, in the order in which they ended.
+        The jobs' return values, in the order in which they ended.
     """
     todo = [item for item in planned if not item.directory.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
@@ -269,7 +269,7 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
 def _submit(
     launcher: Launcher, options: DictConfig, jobs: Sequence[Sequence[str]], first: int
 ) -> Sequence[JobReturn]:
-    """Launch jobs and wait for them; errors of sbatch become one line with the launcher's key."""
+    """Launch jobs and wait for them; an error of sbatch becomes one line with the launcher's key."""
     if not type(launcher).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
         return launcher.launch(jobs, first)
     if type(launcher).__name__ == "SlurmLauncher":
@@ -292,7 +292,7 @@ def _submit(
 
 
 def _check_accounting() -> None:
-    """Keep submitit from calling ``sacct`` all the time where SLURM has no accounting."""
+    """Keep submitit from polling ``sacct`` where SLURM has no accounting."""
     with contextlib.suppress(OSError):
         answer = subprocess.run(["sacct", "--noheader"], check=False, capture_output=True, text=True)
         if answer.returncode != 0:
