@@ -1,4 +1,4 @@
-"""Human Gaussian splatting from a few calibrated photographs: train, ablate, sweep, compare."""
+"""Human Gaussian splatting from a few calibrated photographs: training, ablations, sweeps, tables."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ __all__ = ["GHGS", "Batch", "Cameras", "Gaussians", "Predictor", "render"]
 
 
 def __getattr__(name: str):
-    """Import public names on first use: ``ghgs --help`` must not wait for PyTorch."""
+    """Import public names on first use, so that ``ghgs --help`` does not load PyTorch."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

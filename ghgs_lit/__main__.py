@@ -1,4 +1,4 @@
-"""``python -m ghgs_lit`` is ``ghgs``."""
+"""Run ``ghgs`` as ``python -m ghgs_lit``."""
 
 import sys
 

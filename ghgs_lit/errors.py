@@ -1,20 +1,20 @@
-"""Errors that a user can correct; the command line prints them as one line and exits with 1."""
+"""Errors that a user can correct; the command line prints them in one line and exits with 1."""
 
 import importlib
 from types import ModuleType
 
 
 class InputError(ValueError):
-    """Bad input; the message names the path or key, what was expected and what was found."""
+    """Bad input; the message names the path or key, the expectation and the value."""
 
 
 def choice(key: str, value: object, allowed: tuple) -> None:
-    """Refuse the value of a configuration's key unless it is one of those allowed.
+    """Reject a value of a configuration key that is not among those allowed.
 
     Args:
         key: dotted key, for the message.
-        value: what the key holds.
-        allowed: all values that the key may hold.
+        value: the configured value.
+        allowed: all allowed values.
 
     Raises:
         InputError: names the key, all allowed values and ``value``.
@@ -24,13 +24,13 @@ def choice(key: str, value: object, allowed: tuple) -> None:
 
 
 def require(condition: bool, key: str, expected: str, found: object) -> None:
-    """Refuse the value of a path or key unless a condition holds.
+    """Reject the value of a path or key unless a condition holds.
 
     Args:
-        condition: whether the value is good.
-        key: path or dotted key that has the value.
-        expected: what would be good, in words.
-        found: the value, shown by :func:`shown`.
+        condition: whether the value is valid.
+        key: path or dotted key of the value.
+        expected: a valid value, in words.
+        found: the value, formatted by :func:`shown`.
 
     Raises:
         InputError: "<key>: expected <expected>; found <found>".
@@ -40,8 +40,8 @@ def require(condition: bool, key: str, expected: str, found: object) -> None:
 
 
 def shown(value: object) -> str:
-    """A value in a message: as Python writes it,
-    if it can (numbers of more than 4300 digits it cannot)."""
+    """Format a value for a message by ``repr``, except integers of more than 4300 digits, where it
+    fails."""
     try:
         return repr(value)
     except ValueError:
@@ -49,12 +49,12 @@ def shown(value: object) -> str:
 
 
 def installed(package: str, extra: str, key: str) -> ModuleType:
-    """Import a package that an extra of this one installs.
+    """Import an optional dependency, which an extra of this package installs.
 
     Args:
         package: name of the module.
         extra: name of the extra, for the command in the message.
-        key: dotted key that needs the package, for the message.
+        key: dotted key that requires the package, for the message.
 
     Raises:
         InputError: the package cannot be imported; the message contains the command that installs it.

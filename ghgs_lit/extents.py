@@ -1,4 +1,4 @@
-"""Extents of masks, and indices of their pixels."""
+"""Extents of masks, indices of their pixels, and sizes of shape buckets."""
 
 from typing import NamedTuple
 
@@ -8,8 +8,7 @@ from torch import Tensor
 
 
 class Extent(NamedTuple):
-    """Number of pixels of a mask, and its bounding box (ends excluded; no meaning for an
-    empty mask)."""
+    """Number of pixels of a mask, and its bounding box (ends excluded; undefined for an empty mask)."""
 
     count: int
     top: int
@@ -22,17 +21,17 @@ class Extent(NamedTuple):
 
         Args:
             stride: side of a cell in pixels.
-            count: number of cells that are touched.
+            count: number of cells with a pixel of the mask.
 
         Returns:
-            The extent, whose bounding box holds every touched cell.
+            The extent, whose bounding box contains all these cells.
         """
         bottom = (self.bottom - 1) // stride + 1
         right = (self.right - 1) // stride + 1
         return Extent(count, self.top // stride, bottom, self.left // stride, right)
 
     def cells(self, stride: int) -> int:
-        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches.
+        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box overlaps.
 
         Args:
             stride: side of a cell in pixels.
@@ -45,19 +44,12 @@ class Extent(NamedTuple):
 
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
-    """Extent of each mask, with one device-to-host synchronisation.
-
-    Args:
-        masks: [n, H, W].
-
-    Returns:
-        n extents.
-    """
+    """Extent of each of n masks, with one device-to-host synchronisation."""
     return [Extent(*numbers) for numbers in extent_numbers(masks).tolist()]
 
 
 def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
-    """The numbers of each mask's :class:`Extent`, on the masks' device, without a synchronisation.
+    """Fields of each mask's :class:`Extent`, on the device of the masks, without a synchronisation.
 
     Args:
         masks: [n, H, W].
@@ -76,8 +68,8 @@ def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) ->
 
     Args:
         mask: bools of any shape.
-        count: how many are True.
-        repeats: there may be fewer; the first is repeated there.
+        count: number of True values.
+        repeats: allow fewer True values; on a GPU, the first index is repeated for the missing ones.
 
     Returns:
         Ascending indices [count].
@@ -86,20 +78,20 @@ def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) ->
     if flat.device.type == "cpu":
         return flat.nonzero()[:, 0]
     index = torch.arange(len(flat), device=flat.device)
-    target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
+    target = torch.where(flat, flat.cumsum(0) - 1, count)  # False: to the last index, cut off below
     places = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
     return places.scatter_(0, target, index)[:count]
 
 
-#: Shape buckets of an octave.
+#: Shape buckets per octave.
 _STEPS = 8
 
 
 def bucket_size(count: int) -> int:
-    """The smallest shape bucket that holds ``count`` rows.
+    """The smallest shape bucket for ``count`` rows.
 
-    1 to 16, then eight of equal steps in each octave (18, 20, ..., 32, 36, ...): at most an
-    eighth is added.
+    Buckets are 1 to 16, then eight of equal steps in each octave (18, 20, ..., 32, 36, ...): at most
+    an eighth of the rows is padding.
     """
     step = max((1 << max(count - 1, 0).bit_length()) // (2 * _STEPS), 1)
     return -(-count // step) * step

@@ -1,5 +1,5 @@
-"""Files that several processes share: atomic writes,
-and locks that are freed when their process ends."""
+"""Files that several processes share: atomic writes, and locks that are freed when their process
+ends."""
 
 import contextlib
 import errno
@@ -14,18 +14,18 @@ from typing import Any
 
 from ghgs_lit.errors import InputError, require
 
-# Lock files that this process holds; they are not opened again:
-# closing a second handle would free the lock.
+# Lock files that this process holds; never opened again, because closing a second descriptor would
+# free the lock.
 _HELD: set[Path] = set()
-_OWNER = b"process "  #: How the text of a lock file begins
+_OWNER = b"process "  #: Prefix of a lock file's text
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
-    """Write a file next to ``path``, wait for the disk, then rename it to ``path``.
+    """Write a file next to ``path``, synchronise it with the disk, then rename it to ``path``.
 
-    Readers see the old file or the new one, never a part. Folders are made. A link is replaced,
-    and the file that it points to stays. A temporary file of a process that was killed is
-    removed by the next write of the same path on the same machine.
+    Readers find the old file or the new one, never a part. Missing folders are created. A link is
+    replaced; its target stays. If a process is killed, its temporary file is removed by the next
+    write of the same path on the same machine.
 
     Args:
         path: the file.
@@ -33,7 +33,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 
     Raises:
         InputError: ``path`` is, or links to, a directory, a device or a pipe.
-        OSError: the disk is full, or the folder cannot be written to; ``filename`` is ``path``.
+        OSError: the disk is full, or the folder is not writable; ``filename`` is ``path``.
     """
     path = Path(path)
     _require_replaceable(path)
@@ -46,18 +46,18 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
         os.replace(temporary, path)
         _sync(path.parent)
     except Exception as error:
-        # PyTorch and safetensors report a full disk by other errors.
+        # PyTorch and safetensors raise other errors for a full disk.
         cause = error if isinstance(error, OSError) else _refusal(temporary)
         if cause is None or cause.errno is None:
             raise
         raise OSError(cause.errno, cause.strerror, str(path)) from error
     finally:
-        with contextlib.suppress(OSError):  # a folder that cannot be written to has no such file
+        with contextlib.suppress(OSError):  # a folder that is not writable
             temporary.unlink(missing_ok=True)
 
 
 def _require_replaceable(path: Path) -> None:
-    """Refuse what a new file must not take the place of.
+    """Reject a path that a new file must not replace.
 
     Raises:
         InputError: ``path`` is, or links to, a directory, a device or a pipe.
@@ -71,16 +71,18 @@ def _require_replaceable(path: Path) -> None:
 
 
 def require_free(path: str | Path, key: str, overwrite: bool) -> None:
-    """The rule for a file that a key names: one that exists is replaced only with ``overwrite``.
+    """Check a file path of a configuration key; an existing file requires ``overwrite``.
+
+    Called before the work, so that the error precedes it.
 
     Args:
-        path: the file, perhaps with ``~``.
+        path: the file; ``~`` is expanded.
         key: dotted key of the command line, for messages.
-        overwrite: whether a file that exists may be replaced.
+        overwrite: whether an existing file may be replaced.
 
     Raises:
-        InputError: the file exists, is none that :func:`write_atomically` would replace, or its
-            folder cannot be written to, which is an error before hours of work, not after them.
+        InputError: the file exists, cannot be replaced by :func:`write_atomically`, or its folder is
+            not writable.
     """
     path = Path(path).expanduser()
     _require_replaceable(path)
@@ -90,18 +92,18 @@ def require_free(path: str | Path, key: str, overwrite: bool) -> None:
 
 
 def require_writable(folder: Path, key: str, what: str) -> Path:
-    """Check that a folder can be written to, or made.
+    """Check that a folder is writable, or can be created.
 
     Args:
         folder: its absolute path.
         key: dotted key of the command line, for messages.
-        what: will be written, for messages.
+        what: the file or files to write, for messages.
 
     Returns:
-        It, or the folder above it that exists.
+        The folder, or its nearest parent that exists.
 
     Raises:
-        InputError: that cannot be written to.
+        InputError: that folder is not writable.
     """
     place = next(path for path in (folder, *folder.parents) if path.exists())
     fits = place.is_dir() and os.access(place, os.W_OK | os.X_OK)
@@ -111,10 +113,10 @@ def require_writable(folder: Path, key: str, what: str) -> Path:
 
 @contextlib.contextmanager
 def naming(folder: Path) -> Iterator[None]:
-    """Name a folder in each OSError inside the context that names no file, such as a full disk.
+    """Add a folder to each OSError inside the context that has no file name, such as for a full disk.
 
     Args:
-        folder: where the files are written inside the context.
+        folder: where files are written inside the context.
 
     Raises:
         OSError: as inside the context, with ``folder`` as its ``filename``.
@@ -126,7 +128,7 @@ def naming(folder: Path) -> Iterator[None]:
             raise
         probe = folder / f".{os.getpid()}.tmp"
         try:
-            # NumPy reports a full disk without the system's number.
+            # NumPy's error for a full disk has no errno.
             cause = error if error.errno is not None else _refusal(probe)
         finally:
             probe.unlink(missing_ok=True)
@@ -136,8 +138,7 @@ def naming(folder: Path) -> Iterator[None]:
 
 
 def _refusal(path: Path) -> OSError | None:
-    """The error that the system gives when more is written to the file ``path``;
-    None: it can be written."""
+    """The error of the system when more is written to the file ``path``; None: writing succeeds."""
     try:
         with path.open("ab") as file:
             file.write(bytes(1 << 20))
@@ -159,16 +160,16 @@ def resolved(path: str | Path) -> Path:
 
 
 def write_text_atomically(path: str | Path, text: str) -> None:
-    """Write ``text`` to ``path``, with the errors of :func:`write_atomically`."""
+    """Write ``text`` to ``path``; errors as in :func:`write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
 def require_no_links(directory: Path, names: Iterable[str]) -> None:
-    """Refuse links where libraries write: they would change the files that the links point to.
+    """Reject links where libraries write, because they would change the targets of the links.
 
     Args:
         directory: a run's directory.
-        names: of its files and folders; the files directly in these folders are checked, too.
+        names: files and folders in it; files directly in these folders are checked, too.
 
     Raises:
         InputError: names the first link.
@@ -184,8 +185,8 @@ def append_line(path: Path, text: str) -> None:
     """Append ``text`` as a new line, also after an unfinished line of a killed process.
 
     Args:
-        path: the file; it and its folders are made.
-        text: without the line's end.
+        path: the file; it and its folders are created if missing.
+        text: without a newline at the end.
 
     Raises:
         OSError: the file is a link, or cannot be written.
@@ -216,10 +217,10 @@ def _is_running(process: int) -> bool:
 
 
 def _sync(place: Path) -> None:
-    """Wait until a file or folder is on the disk, so that a rename survives a power cut."""
+    """Flush a file or folder to the disk, so that a rename survives a power failure."""
     try:
         handle = os.open(place, os.O_RDONLY)
-    except OSError:  # some systems do not open folders
+    except OSError:  # some systems cannot open folders
         return
     try:
         os.fsync(handle)
@@ -228,7 +229,7 @@ def _sync(place: Path) -> None:
 
 
 def _place_of_lock(path: str | Path) -> Path:
-    """The path without links in its folders; the file itself must be none."""
+    """The path, with links in its folders resolved, but not a link to the file."""
     path = Path(path)
     return resolved(path.parent) / path.name
 
@@ -238,17 +239,17 @@ def _open_lock(path: Path, flags: int) -> int:
 
     Args:
         path: the file, without links in its folders.
-        flags: of :func:`os.open`.
+        flags: flags of :func:`os.open`.
 
     Returns:
-        The handle.
+        The file descriptor.
 
     Raises:
-        InputError: it is a link, no file, or holds something else than an owner.
+        InputError: it is a link, not a file, or has other content than an owner.
         OSError: it cannot be opened.
     """
     try:
-        # Opening a pipe would wait for its other end.
+        # Opening a pipe would block until its other end is opened.
         handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o664)
     except OSError as error:
         require(not path.is_symlink(), str(path), "a lock file", "a link")
@@ -262,22 +263,22 @@ def _open_lock(path: Path, flags: int) -> int:
 
 @contextlib.contextmanager
 def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
-    """Lock a file for this process while the context lasts.
+    """Hold a lock file for this process within the context.
 
-    A POSIX record lock (``fcntl``): the system frees it however the process ends, forked children
-    do not inherit it, and NFS shares it among machines. The file holds the text of
+    A POSIX record lock (``fcntl``): the system frees it however the process ends, forked children do
+    not inherit it, and NFS shares it among machines. The file contains the text of
     :func:`lock_owner`.
 
     Args:
-        path: the lock file; it and its folders are made.
-        wait: wait until another process frees the lock.
+        path: the lock file; it and its folders are created if missing.
+        wait: block until another process frees the lock.
 
     Yields:
-        Whether it is locked now: False if another process holds it, or this one does already.
+        Whether the lock was acquired; False: another process, or this one already, holds it.
 
     Raises:
-        InputError: the file system has no locks, or the file is a link or holds anything but an
-            owner: it is not emptied.
+        InputError: the file system has no locks, or the file is a link or has other content than an
+            owner, which is kept.
     """
     path = _place_of_lock(path)
     if path in _HELD:
@@ -296,13 +297,13 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
 
 
 def _locked_file(path: Path, wait: bool) -> tuple[int, bool]:
-    """Handle of the file, and whether it is locked now."""
+    """File descriptor of the lock file, and whether the lock was acquired."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = _open_lock(path, os.O_RDWR | os.O_CREAT)
         try:
             locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
-            if not locked:  # is_locked() in another process may have held it for a moment
+            if not locked:  # is_locked() in another process holds it briefly
                 time.sleep(0.05)
                 locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
         except BaseException:
@@ -311,11 +312,11 @@ def _locked_file(path: Path, wait: bool) -> tuple[int, bool]:
         with contextlib.suppress(FileNotFoundError):
             if not locked or os.path.samestat(os.fstat(handle), os.stat(path)):
                 return handle, locked
-        os.close(handle)  # the process that held it has removed the file with its folder
+        os.close(handle)  # its previous owner has removed the file with its folder
 
 
 def is_locked(path: str | Path) -> bool:
-    """Whether a process, this one included, holds the lock of a file.
+    """Whether a process, including this one, holds the lock of a file.
 
     Raises:
         InputError: as for :func:`lock`.
@@ -333,7 +334,7 @@ def is_locked(path: str | Path) -> bool:
 
 
 def lock_owner(path: str | Path) -> str:
-    """The process that locked the file ``path`` last, for messages."""
+    """The process that last locked the file ``path``, for messages."""
     try:
         return Path(path).read_text().strip() or "another process"
     except OSError:
@@ -341,16 +342,16 @@ def lock_owner(path: str | Path) -> str:
 
 
 def _try_lock(handle: int, kind: int, wait: bool, path: Path) -> bool:
-    """Lock or share an open file by ``fcntl.lockf``.
+    """Lock an open file by ``fcntl.lockf``.
 
     Args:
-        handle: of the file.
+        handle: file descriptor.
         kind: ``fcntl.LOCK_EX`` or ``fcntl.LOCK_SH``.
-        wait: wait until no other process has a lock that excludes this one.
+        wait: block until no other process holds a conflicting lock.
         path: of the file, for messages.
 
     Returns:
-        Whether it is locked; False: another process has it, and ``wait`` is false.
+        Whether it is locked; False: another process holds it, and ``wait`` is false.
 
     Raises:
         InputError: the file system has no locks.

@@ -1,5 +1,5 @@
-"""Readers of text files, of limited size and depth, and of arrays;
-every defect is an :class:`InputError`."""
+"""Readers of text files, with limits of size and depth, and of arrays; every defect is an
+:class:`InputError`."""
 
 import csv
 import functools
@@ -16,24 +16,24 @@ import yaml
 
 from ghgs_lit.errors import InputError, require
 
-if TYPE_CHECKING:  # runs and --help read no arrays
+if TYPE_CHECKING:  # NumPy is imported on first use, for the start time of commands
     import numpy as np
 
-#: Largest size of a text file in bytes, and the most levels of nested mappings and lists.
+#: Largest size of a text file in bytes, and largest depth of nested mappings and lists.
 LARGEST = 1 << 28
 DEEPEST = 64
 _NO_TEXT = (yaml.YAMLError, csv.Error)
 
 
 def require_file(path: str | os.PathLike, expected: str) -> None:
-    """Refuse a path that is no regular file: missing, a folder, a link to itself, a pipe.
+    """Reject a path that is not a regular file: missing, a folder, a link to itself, a pipe.
 
     Args:
-        path: the path; a link to a regular file is good.
-        expected: what the file would hold, in words.
+        path: the path; a link to a regular file is valid.
+        expected: expected content, in words.
 
     Raises:
-        InputError: names the path and what is there.
+        InputError: names the path and what was found there.
     """
     try:
         is_file = stat.S_ISREG(os.stat(path).st_mode)
@@ -46,11 +46,11 @@ def require_file(path: str | os.PathLike, expected: str) -> None:
 
 
 def require_folder(folder: Path, expected: str = "the folder of the data set") -> None:
-    """Refuse a folder that is missing.
+    """Reject a folder that is missing.
 
     Args:
         folder: its path.
-        expected: what the folder would be, in words.
+        expected: the expected folder, in words.
 
     Raises:
         InputError: names the path.
@@ -61,30 +61,28 @@ def require_folder(folder: Path, expected: str = "the folder of the data set") -
 
 
 def composed(name: str) -> str:
-    """A name in its composed spelling (NFC): macOS writes an umlaut as two characters."""
+    """Normalise a name to composed characters (NFC); macOS stores an umlaut as two characters."""
     return unicodedata.normalize("NFC", name)
 
 
 def parts_of(name: str) -> list[str]:
-    """Folders and file of a path as any system writes it: with slashes or backslashes,
-    composed or not."""
+    """Split a path with slashes or backslashes into NFC-normalised folders and file."""
     return composed(name).replace("\\", "/").split("/")
 
 
 def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path | None:
-    """The file or folder that ``name`` means, as a file,
-    a program or a user of any system spells it.
+    """Find the file or folder ``name``, also if another program or system spelled it.
 
-    A path that exists as it is written counts; otherwise its parts may have backslashes, letters
-    composed of two characters, and upper or lower case where that leaves one path.
+    A path that exists exactly as written takes precedence. Otherwise the name may contain backslashes
+    and characters that are not NFC-normalised, and may differ by case if only one entry matches.
 
     Args:
-        folder: where relative names begin.
+        folder: base of relative names.
         name: a name or path, without the suffix where ``suffixes`` are given.
         suffixes: endings, the preferred first.
 
     Returns:
-        An existing path; None: there is none.
+        An existing path; None: no match.
     """
     for suffix in suffixes:
         try:
@@ -102,8 +100,7 @@ def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path 
 
 
 def _alike(folder: Path, name: str) -> Path | None:
-    """The only entry of a folder that is spelled as ``name``,
-    or else differs by upper and lower case."""
+    """The only entry of a folder that is spelled as ``name``, or else differs only by case."""
     if not folder.is_dir():
         return None
     paths = _listed(folder, folder.stat().st_mtime_ns).get(name.casefold(), [])
@@ -116,9 +113,7 @@ def _alike(folder: Path, name: str) -> Path | None:
 def _listed(folder: Path, changed: int) -> dict[str, list[Path]]:
     """Entries of a folder by their composed names in lower case.
 
-    Args:
-        folder: an existing one.
-        changed: its time of modification in nanoseconds; a folder that changed is listed anew.
+    ``changed``, the folder's time of modification in nanoseconds, invalidates the cache.
     """
     paths: dict[str, list[Path]] = {}
     for path in sorted(folder.iterdir()):
@@ -127,14 +122,14 @@ def _listed(folder: Path, changed: int) -> dict[str, list[Path]]:
 
 
 def read_text(path: Path, expected: str = "text") -> str:
-    """The text of a UTF-8 file without byte order mark.
+    """Read a UTF-8 file, without its byte order mark.
 
     Args:
         path: the file.
-        expected: what it would hold, in words.
+        expected: expected content, in words.
 
     Raises:
-        InputError: no file, over 256 MB, or no UTF-8.
+        InputError: no file, over 256 MB, or not UTF-8.
     """
     require_file(path, expected)
     try:
@@ -146,32 +141,32 @@ def read_text(path: Path, expected: str = "text") -> str:
 
 
 def read_json(path: Path, expected: str = "JSON") -> Any:
-    """The content of a JSON file.
+    """Read a JSON file.
 
     Args:
         path: the file.
-        expected: what it would hold, in words.
+        expected: expected content, in words.
 
     Raises:
-        InputError: as for :func:`read_text`; no JSON; more than :data:`DEEPEST` levels.
+        InputError: as for :func:`read_text`; not JSON; more than :data:`DEEPEST` levels.
     """
     return read_parsed(path, expected, json.loads)
 
 
 def read_yaml(path: Path) -> Any:
-    """The plain data of a YAML file.
+    """Read a YAML file of plain data.
 
     Raises:
-        InputError: as for :func:`read_json`, or an alias, by which a file grows without limit.
+        InputError: as for :func:`read_json`, or an alias, by which content can grow without limit.
     """
     return read_parsed(path, "YAML", _plain_yaml)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file, as dicts with the names of its header.
+    """Read the rows of a CSV file as dicts keyed by its header.
 
     Raises:
-        InputError: as for :func:`read_text`, or no CSV.
+        InputError: as for :func:`read_text`, or not CSV.
     """
     return read_parsed(
         path, "CSV with a header", lambda text: list(csv.DictReader(io.StringIO(text, newline="")))
@@ -179,8 +174,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
-    """The mappings of a JSON Lines file; lines that are no mapping, such as unfinished ones,
-    are skipped.
+    """Iterate over the mappings of a JSON Lines file, without other lines, such as unfinished ones.
 
     Raises:
         InputError: there is no such file.
@@ -196,22 +190,22 @@ def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray":
-    """The array of an ``.npy`` file, which may hold no objects.
+    """Read an ``.npy`` file without Python objects.
 
     Args:
         path: the file.
-        expected: what it would hold, in words.
+        expected: expected content, in words.
 
     Raises:
-        InputError: missing, another format, or cut short.
+        InputError: missing, another format, or truncated.
     """
-    import numpy as np  # here: commands that read no array start sooner
+    import numpy as np  # commands without arrays start sooner
 
     require_file(path, expected)
     try:
-        # Mapping the file fails where it is too short; reading it would allocate the memory first.
+        # Mapping a truncated file fails at once; reading it would first allocate the memory.
         return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
-    except Exception as error:  # headers are Python, whose tokenizer raises other errors
+    except Exception as error:  # headers are Python literals, whose tokenizer raises further errors
         raise InputError(f"{path}: expected {expected}; found a file that cannot be read: {error}") from error
 
 
@@ -223,16 +217,16 @@ def _plain_yaml(text: str) -> Any:
 
 
 def check_yaml(text: str, aliases: bool = True, most: int = 1_000_000) -> None:
-    """Refuse YAML that is unsafe to load.
+    """Reject YAML that is unsafe to load.
 
     Args:
         text: the YAML.
         aliases: whether aliases (``*name``) are allowed.
-        most: largest number of values, of aliases as often as they are used.
+        most: largest number of values; each use of an alias counts the values of its anchor.
 
     Raises:
         ValueError: more than :data:`DEEPEST` levels or ``most`` values, or a forbidden alias.
-        yaml.YAMLError: no YAML.
+        yaml.YAMLError: not YAML.
     """
     sizes: dict[str | None, int] = {}
     unfinished: list[list[Any]] = [[None, 0]]
@@ -262,12 +256,12 @@ def check_yaml(text: str, aliases: bool = True, most: int = 1_000_000) -> None:
 
 
 def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
-    """What a parser makes of the text of a file.
+    """Read a file and parse its text.
 
     Args:
         path: the file.
-        expected: what it would hold, in words.
-        parse: turns the text into plain data.
+        expected: expected content, in words.
+        parse: converts the text to plain data.
 
     Raises:
         InputError: as for :func:`read_text`; ``parse`` fails; more than :data:`DEEPEST` levels.
@@ -289,10 +283,10 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
 
 
 def _levels(value: Any) -> int:
-    """Levels of nested mappings and lists.
+    """Number of levels of nested mappings and lists.
 
     Raises:
-        ValueError: a whole number that no float can hold.
+        ValueError: an integer that does not fit in a float.
     """
     if isinstance(value, int) and value.bit_length() > 1023:
         raise ValueError(f"a number of {value.bit_length()} bits")
@@ -301,7 +295,7 @@ def _levels(value: Any) -> int:
 
 
 def _require_plain(value: Any) -> None:
-    """Refuse what JSON does not have, such as the dates, sets and bytes of YAML.
+    """Reject types that JSON does not have, such as the dates, sets and bytes of YAML.
 
     Raises:
         ValueError: names the type.

@@ -1,9 +1,11 @@
-"""Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
+"""Gaussians as PLY files for viewers of 3D Gaussian Splatting.
 
-Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit
-quaternions ``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment in the
-header has the image constants that the Gaussians were made for; other programs ignore it, below the
-line of the element: 3D Gaussian Splatting's own viewer takes the third line for that."""
+Positions are in metres in the world frame; opacities are stored as logits, standard deviations as
+logarithms, rotations as unit quaternions ``(w, x, y, z)``, colours as the constant term of spherical
+harmonics. A comment in the header has the renderer settings (low-pass filter, antialiasing) that the
+Gaussians were made for; other programs ignore it. It follows the ``element`` line, because 3D
+Gaussian Splatting's own viewer takes the third line of the file for that one.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +25,7 @@ SH_CONSTANT = 0.5 / np.sqrt(np.pi)
 """Value of the constant spherical harmonic: colour = 0.5 + SH_CONSTANT * f_dc."""
 _CONSTANTS = "ghgs_lit low_pass={low_pass!r} antialiased={antialiased}"
 _CONSTANTS_PATTERN = re.compile(r"ghgs_lit low_pass=(\S+) antialiased=(True|False)")
-_OPACITY_LIMIT = 1e-6  # a logit of exactly 0 or 1 is infinite
+_OPACITY_LIMIT = 1e-6  # logits of 0 and 1 are infinite
 _SMALLEST_SCALE = 1e-9  # metres
 _GROUPS = {
     "means": ("x", "y", "z"),
@@ -36,11 +38,11 @@ _GROUPS = {
 
 
 def write_ply(gaussians: Gaussians, path: str | Path) -> None:
-    """Write the Gaussians of one subject.
+    """Write the Gaussians of one subject, atomically.
 
     Args:
         gaussians: of one subject, with RGB colours.
-        path: of the file, which is written whole or not at all.
+        path: of the file.
 
     Raises:
         InputError: several subjects, or other colours.
@@ -50,10 +52,9 @@ def write_ply(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def ply_bytes(gaussians: Gaussians) -> bytes:
-    """The content of the file that :func:`write_ply` writes.
+    """Content of the file that :func:`write_ply` writes.
 
-    The format is that of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023),
-    whose viewers read it.
+    The format is that of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023).
 
     Args:
         gaussians: of one subject, with RGB colours.
@@ -85,7 +86,7 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
 
 
 def stored_values(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    """Values of Gaussians as files hold them.
+    """Values of Gaussians as written to files.
 
     Args:
         gaussians: of any number of subjects.
@@ -100,11 +101,11 @@ def stored_values(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> d
 
 
 def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> bytes:
-    """The content of a binary PLY with a vertex for each row of the columns.
+    """Content of a binary PLY with one vertex per row.
 
     Args:
-        columns: numbers of each property by name [N].
-        comments: lines of the header, below that of the vertices.
+        columns: values [N] of each property, by name.
+        comments: lines of the header, written below the ``element`` line.
 
     Returns:
         A little-endian binary PLY.
@@ -117,7 +118,7 @@ def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()
 
 
 def _read(path: Path) -> PlyData:
-    """Read a PLY whose comments need not be ASCII, as some programs write them."""
+    """Read a PLY, also with comments that are not ASCII, which some programs write."""
     try:
         return PlyData.read(path)
     except UnicodeDecodeError:
@@ -128,8 +129,8 @@ def _read(path: Path) -> PlyData:
 def read_ply(path: Path) -> Gaussians:
     """Read a 3DGS PLY as the Gaussians of one subject, without view-dependent colours.
 
-    A file without this package's comment is taken to be made for 3D Gaussian Splatting's own
-    renderer: a low-pass of 0.3 px^2, not antialiased.
+    A file without this package's comment is read as made for the renderer of 3D Gaussian Splatting: a
+    low-pass filter of 0.3 px^2, not antialiased.
 
     Args:
         path: of the file.
@@ -138,7 +139,7 @@ def read_ply(path: Path) -> Gaussians:
         The Gaussians, float32, on the CPU.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file is not a 3DGS PLY.
     """
     try:
         content = _read(path)

@@ -9,9 +9,9 @@ Conventions of the whole package:
 * quaternions are ``(w, x, y, z)``; lengths are metres; depth is z in the camera;
 * images are float in ``[0, 1]``, RGB, on a black background outside the mask.
 
-Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input
-size, ``h w`` target size (of tokens: rows and columns), ``N`` packed Gaussians or tokens,
-``L`` layers."""
+Letters in shapes: ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input size, ``h w``
+target size (of tokens: rows and columns), ``N`` packed Gaussians or tokens, ``L`` layers.
+"""
 
 import dataclasses
 import math
@@ -28,20 +28,19 @@ from ghgs_lit.extents import Extent, extents, true_places
 
 _T = TypeVar("_T")
 
-#: Pixels that dense heads decode: whole views, or windows around the subject.
+#: Pixels decoded by dense heads: whole views, or windows around the subject.
 DecodedPixels = Literal["all", "subject"]
 
 
 def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
-    """Apply a function to every tensor inside nested dataclasses, tuples, named ones too,
-    lists and dicts.
+    """Apply a function to every tensor inside nested dataclasses, (named) tuples, lists and dicts.
 
     Args:
-        value: a tensor, such a container, or anything else, which stays.
-        fn: what a tensor becomes.
+        value: a tensor, such a container, or any other value, which is returned unchanged.
+        fn: maps a tensor to its replacement.
 
     Returns:
-        A container of the same kind.
+        A container of the same type.
     """
     if isinstance(value, Tensor):
         return fn(value)
@@ -64,7 +63,7 @@ class TensorStruct:
         return map_tensors(self, lambda t: t.to(*args, **kwargs))
 
     def detach(self):
-        """The same tensors without their gradient."""
+        """The same tensors, detached from the autograd graph."""
         return map_tensors(self, Tensor.detach)
 
     def pin_memory(self):
@@ -90,13 +89,13 @@ class Cameras(TensorStruct):
         """Camera centres in the world, ``-R^T t``."""
         rotation = self.extrinsics[..., :3, :3]
         translation = self.extrinsics[..., :3, 3]
-        # Written out: a product of matrices would run in half precision under autocast.
+        # Elementwise: autocast would run a matrix product in half precision.
         return -(rotation * translation[..., :, None]).sum(-2)
 
     @cached_property
     def has_skew(self) -> bool:
-        """Whether any ``K[0, 1]`` is not 0; a device-to-host synchronisation at
-        the first use, unless :meth:`note_skew` was called."""
+        """Whether any ``K[0, 1]`` is not 0; a device-to-host synchronisation at first use, unless
+        :meth:`note_skew` was called."""
         return bool(self.any_skew)
 
     @property
@@ -105,30 +104,30 @@ class Cameras(TensorStruct):
         return (self.intrinsics[..., 0, 1] != 0).any()
 
     def note_skew(self, has_skew: bool) -> None:
-        """Keep :attr:`has_skew`, which was read together with other values."""
+        """Store :attr:`has_skew` that was read together with other values."""
         self.__dict__.update(has_skew=has_skew)
 
     def __getitem__(self, index) -> "Cameras":
         return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])
 
     def resized(self, height: int, width: int) -> "Cameras":
-        """The same cameras for an image resized to ``height`` x ``width``."""
+        """The same cameras for an image resized to ``height`` x ``width`` pixels."""
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, :] *= width / self.width
         intrinsics[..., 1, :] *= height / self.height
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
-        """The same cameras for a crop.
+        """The same cameras for a crop of the image.
 
         Args:
-            top: row of the image that the crop starts at; negative: rows that are padded.
-            left: column that it starts at, the same.
+            top: first row of the crop; negative: number of rows padded above the image.
+            left: first column of the crop; negative: number of columns padded on the left.
             height: of the crop in pixels.
             width: of the crop in pixels.
 
         Returns:
-            Cameras with other principal points.
+            Cameras with shifted principal points.
         """
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
@@ -138,9 +137,12 @@ class Cameras(TensorStruct):
 
 @dataclass(frozen=True)
 class Targets(TensorStruct):
-    """Target images, from cameras other than the input cameras. ``names``: of the images
-    of each subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for
-    all subjects. ``depths``: true z-depths in metres, 0 where unknown; None: unknown."""
+    """Target images, from cameras other than the input cameras.
+
+    ``names``: names of the images of each subject. ``protocols``: the target protocol of each of the
+    ``T`` targets, the same for all subjects. ``depths``: true z-depths in metres, 0 where unknown;
+    None: unknown.
+    """
 
     images: Float[Tensor, "B T 3 h w"]
     masks: Bool[Tensor, "B T h w"]
@@ -164,11 +166,11 @@ class Targets(TensorStruct):
 class Batch(TensorStruct):
     """Input views of ``B`` subjects, with masks, cameras and optional annotations.
 
-    ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in
-    metres, 0 where unknown. ``alpha``: soft mattes, the share of each pixel that shows the
-    subject, by which its colour is multiplied. ``log_gains``: logarithms of the cameras' gains,
-    by which images are already divided. ``views``: names of the input views of each subject.
-    None: unknown."""
+    ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in metres, 0
+    where unknown. ``alpha``: soft mattes: the covered share of each pixel, by which its colour is
+    multiplied. ``log_gains``: logarithms of the cameras' gains, by which images are already divided.
+    ``views``: names of the input views of each subject. None: unknown.
+    """
 
     images: Float[Tensor, "B V 3 H W"]
     masks: Bool[Tensor, "B V H W"]
@@ -182,8 +184,7 @@ class Batch(TensorStruct):
     views: tuple[tuple[str, ...], ...] = ()
 
     def of_views(self, views: Sequence[int]) -> "Batch":
-        """The batch with only the input views of these indices, in their order,
-        and the same targets."""
+        """The batch with only the input views at these indices, in this order, and the same targets."""
         views = list(views)
         names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
@@ -200,8 +201,7 @@ class Batch(TensorStruct):
         return changed
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
-        """``function`` of this batch, computed once and kept for other stages that pass the
-        same function."""
+        """``function(self)``, computed once and cached for all stages that pass the same function."""
         known = self.__dict__.setdefault("_known", {})
         if function not in known:
             known[function] = function(self)
@@ -210,11 +210,11 @@ class Batch(TensorStruct):
     def note(
         self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]], has_skew: bool
     ) -> None:
-        """Keep what a plan read of the masks and cameras.
+        """Cache statistics of the masks and cameras that were read for a plan.
 
         Args:
             extents: :attr:`extents`.
-            pixels: returns :attr:`pixels` in ascending order; called at their first use.
+            pixels: returns :attr:`pixels` in ascending order; called at first use.
             has_skew: :attr:`Cameras.has_skew` of the input cameras.
         """
         self.__dict__.update(extents=list(extents), _pixels=pixels)
@@ -222,21 +222,21 @@ class Batch(TensorStruct):
 
     @cached_property
     def extents(self) -> list[Extent]:
-        """Extent of the subject in each image ``b * V + v``;
-        may cause a device-to-host synchronisation at the first use."""
+        """Extent of the subject in each image ``b * V + v``; may cause a device-to-host
+        synchronisation at first use."""
         return extents(self.masks.flatten(0, 1))
 
     @cached_property
     def pixels(self) -> Int[Tensor, " n"]:
-        """Indices of the subject's pixels among those of all images."""
+        """Flat indices [n] of the subject's pixels among the pixels of all images."""
         noted = self.__dict__.get("_pixels")
         return true_places(self.masks, sum(e.count for e in self.extents)) if noted is None else noted()
 
 
 @dataclass(frozen=True)
 class DepthBounds(TensorStruct):
-    """The nearest and the farthest z-depth, in metres,
-    at which each pixel's ray can meet the subject."""
+    """The nearest and the farthest z-depth, in metres, at which each pixel's ray can meet the
+    subject."""
 
     near: Float[Tensor, "B V H W"]
     far: Float[Tensor, "B V H W"]
@@ -244,12 +244,14 @@ class DepthBounds(TensorStruct):
 
 @dataclass(frozen=True)
 class Tokens(TensorStruct):
-    """Tokens of the kept patches of the whole batch, packed. Token ``n`` is the patch at
-    ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image,
-    row, column. ``grid`` is ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out
-    layers. ``semantic``: features F, detached: they weight the attention, which does not train
-    them. ``real``: which rows are tokens, where each image has the same number of rows, a shape
-    bucket; None: all."""
+    """Tokens of the kept patches of the whole batch, packed.
+
+    Token ``n`` is the patch at ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``);
+    tokens are ordered by image, row, column. ``grid`` is ``(B, V, h, w)``. ``latent``: embeddings E
+    of the encoder's read-out layers. ``semantic``: features F, detached: they weight the attention,
+    whose gradient does not train them. ``real``: mask of valid tokens, if each image has the same
+    number of rows, a shape bucket; None: all are valid.
+    """
 
     latent: tuple[Float[Tensor, "N C"], ...]
     semantic: Float[Tensor, "N S"]
@@ -266,14 +268,14 @@ class Tokens(TensorStruct):
         return self.real is None and self.image.shape[0] == math.prod(self.grid)
 
     def select(self, index: Tensor | slice) -> "Tokens":
-        """The tokens at ``index`` (a slice, a mask or indices) of the same grid."""
+        """The tokens at ``index`` (a slice, a mask or indices), on the same grid."""
         parts = {name: getattr(self, name)[index] for name in ("semantic", "image", "row", "column")}
         parts["real"] = None if self.real is None else self.real[index]
         return dataclasses.replace(self, latent=tuple(layer[index] for layer in self.latent), **parts)
 
     def of_images(self, images: slice) -> "Tokens":
-        """The tokens of consecutive images ``b * V + v``, as one element;
-        may cause a device-to-host synchronisation."""
+        """The tokens of consecutive images ``b * V + v``, as one element; may cause a device-to-host
+        synchronisation."""
         b, v, h, w = self.grid
         if images == slice(0, b * v):
             part = self
@@ -287,14 +289,14 @@ class Tokens(TensorStruct):
         return dataclasses.replace(part, image=part.image - images.start, grid=grid)
 
     def in_precision(self, dtype: torch.dtype) -> "Tokens":
-        """The tokens in a precision; unchanged under autocast, which chooses it."""
+        """The tokens in ``dtype``; unchanged under autocast, which determines the precision."""
         if torch.is_autocast_enabled(self.semantic.device.type) or self.latent[0].dtype == dtype:
             return self
         latent = tuple(layer.to(dtype) for layer in self.latent)
         return dataclasses.replace(self, latent=latent, semantic=self.semantic.to(dtype))
 
     def maps(self, layer: int) -> Float[Tensor, "BV C h w"]:
-        """One layer on the token grid; 0 at patches whose tokens were not kept."""
+        """One layer on the token grid; 0 at patches without a token."""
         b, v, h, w = self.grid
         values = self.latent[layer]
         if not self.is_dense:
@@ -310,7 +312,7 @@ class Tokens(TensorStruct):
 
 @dataclass(frozen=True)
 class DepthMaps(TensorStruct):
-    """Z-depth of each pixel in metres, and the bounds that it lies between, if any."""
+    """Z-depth of each pixel in metres, and its bounds, if any."""
 
     depth: Float[Tensor, "B V H W"]
     valid: Bool[Tensor, "B V H W"]
@@ -334,12 +336,12 @@ class Points(TensorStruct):
 class Gaussians(TensorStruct):
     """3D Gaussians of a batch, packed; ``splits[b]`` of them belong to element ``b``.
 
-    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres;
-    ``colors`` may have any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major
-    index): the input pixel that a Gaussian belongs to, if any. ``low_pass`` (px^2) and
-    ``antialiased``: the settings of the renderer (:class:`ghgs_lit.rendering.RasterSettings`) that
-    they were made for. ``metre``: the length of a metre in the unit of each element's world
-    (:mod:`ghgs_lit.geometry.frame`); None: 1."""
+    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres; ``colors``
+    may have any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index): the
+    input pixel of each Gaussian, if any. ``low_pass`` (px^2) and ``antialiased``: the renderer's
+    settings (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for. ``metre``: the
+    length of a metre in the unit of each element's world (:mod:`ghgs_lit.geometry.frame`); None: 1.
+    """
 
     means: Float[Tensor, "N 3"]
     quaternions: Float[Tensor, "N 4"]
@@ -358,7 +360,7 @@ class Gaussians(TensorStruct):
 
     @property
     def is_finite(self) -> Bool[Tensor, " N"]:
-        """Which Gaussians have finite numbers only; renderers skip the others."""
+        """Which Gaussians have only finite values; renderers skip the others."""
         fields = (self.means, self.quaternions, self.scales, self.opacities[:, None], self.colors)
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 
@@ -368,13 +370,13 @@ class Gaussians(TensorStruct):
         return {n: value for n, value in values.items() if n != "metre" and isinstance(value, Tensor)}
 
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
-        """The Gaussians at ``index`` (slice, mask or indices).
-        ``splits``: their number in each element."""
+        """The Gaussians at ``index`` (slice, mask or indices); ``splits``: their number in each
+        element."""
         changes = {name: values[index] for name, values in self._rows().items()}
         return dataclasses.replace(self, **changes, splits=splits)
 
     def with_more(self, others: "Gaussians") -> "Gaussians":
-        """These and then others; both of one element, with the same optional fields."""
+        """These Gaussians followed by others; both of one element, with the same optional fields."""
         more = others._rows()
         both = {name: torch.cat((values, more[name])) for name, values in self._rows().items()}
         return dataclasses.replace(self, **both, splits=(len(self) + len(others),))
@@ -383,7 +385,7 @@ class Gaussians(TensorStruct):
         """The Gaussians of one batch element.
 
         Args:
-            element: its number; negative: from the last.
+            element: its index; negative: from the end.
 
         Returns:
             The Gaussians, as one element.
@@ -403,10 +405,12 @@ class Gaussians(TensorStruct):
 
 @dataclass(frozen=True)
 class Prediction(TensorStruct):
-    """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth``
-    has a meaning where ``depth_valid``. ``rounds``: depths before the first round and after each (the last is
-    ``depth_maps``). ``drafts``: Gaussians before each, if kept. ``tokens``: of the encoder,
-    inside the model alone."""
+    """Result of ``model(batch)``, in the world frame and unit of the input cameras.
+
+    ``depth`` is meaningful where ``depth_valid``. ``rounds``: depths before the first round and after
+    each (the last is ``depth_maps``). ``drafts``: Gaussians before each round, if kept. ``tokens``:
+    of the encoder, only inside the model.
+    """
 
     gaussians: Gaussians
     depth: Float[Tensor, "B V H W"]
@@ -420,8 +424,7 @@ class Prediction(TensorStruct):
 
 @dataclass(frozen=True)
 class Rendering(TensorStruct):
-    """Rendered Gaussians. ``depth`` is the expected z in metres,
-    ``sum(w z) / max(sum(w), 1e-10)``."""
+    """Rendered Gaussians. ``depth`` is the expected z in metres, ``sum(w z) / max(sum(w), 1e-10)``."""
 
     image: Float[Tensor, "B T C h w"]
     alpha: Float[Tensor, "B T 1 h w"]
