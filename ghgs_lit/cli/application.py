@@ -1,4 +1,4 @@
-"""Run each verb as a Hydra application of ``conf/<verb>.yaml``."""
+"""Run a verb as a Hydra application of ``conf/<verb>.yaml``."""
 
 import os
 import re
@@ -35,29 +35,29 @@ read_as_ghgs()
 
 
 def discard_unused(directory: Path, verb: str, since: float) -> None:
-    """Remove a run's directory that holds nothing but files of a start.
+    """Remove a run's directory that contains nothing but files written at startup.
 
     Args:
-        directory: the run's.
-        verb: name of the verb, which its log has.
-        since: time of the start in seconds since the epoch; older files are not removed.
+        directory: Directory of the run.
+        verb: Name of the verb, which is also the name of its log.
+        since: Time of startup in seconds since the epoch; older files are kept.
     """
     RunDirectory(directory).discard({".hydra", f"{verb}.log"}, since)
 
 
-#: What a run appends to, or what libraries write in place, in addition to the log.
+#: Names that a run appends to or that libraries write in place, in addition to the log.
 _WRITTEN_IN_PLACE = (".hydra", *WRITTEN, SESSIONS)
 
 
 def write_hydra_files(cfg: DictConfig, directory: Path) -> None:
-    """Write ``.hydra`` as Hydra does, but whole and through no link.
+    """Write ``.hydra`` as Hydra does, but atomically and never through a link.
 
     Args:
-        cfg: the configuration that Hydra composed.
-        directory: the run's.
+        cfg: Configuration composed by Hydra.
+        directory: Directory of the run.
 
     Raises:
-        InputError: a file that will be written in place is a link.
+        InputError: A file that will be written in place is a link.
     """
     require_no_links(directory, (*_WRITTEN_IN_PLACE, f"{HydraConfig.get().job.name}.log"))
     hydra_config = HydraConfig.instance().cfg
@@ -68,13 +68,13 @@ def write_hydra_files(cfg: DictConfig, directory: Path) -> None:
 
 @dataclass(frozen=True)
 class Verb:
-    """Task function of a verb, which Hydra calls here or in a launcher's processes.
+    """Task function of a verb, which Hydra calls in this process or in those of a launcher.
 
     Attributes:
-        name: of the verb.
-        argv: words of the command, program and verb first.
-        wants_trace: whether errors keep their traceback.
-        started: time of the start in seconds since the epoch.
+        name: Name of the verb.
+        argv: Command-line arguments, program and verb first.
+        wants_trace: Whether errors keep their traceback.
+        started: Time of startup in seconds since the epoch.
     """
 
     name: str
@@ -87,16 +87,15 @@ class Verb:
         """Check the configuration and do the work of the verb.
 
         Args:
-            cfg: the configuration that Hydra composed.
+            cfg: Configuration composed by Hydra.
 
         Returns:
-            What the verb returns.
+            Return value of the verb.
 
         Raises:
-            SystemExit: bad input, outside of a sweep; its message is printed.
+            SystemExit: Bad input, outside a sweep; the message is printed.
         """
-        # Lightning runs sys.argv again for the other processes of a DDP job;
-        # it must contain the verb.
+        # Lightning starts the other processes of a DDP job with sys.argv, which must contain the verb.
         sys.argv = list(self.argv)
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)
@@ -110,13 +109,13 @@ class Verb:
             is_dry = getattr(verb, "dry_run", False)
             if verb.begins_run and not is_dry:
                 run = RunDirectory(directory)
-                if run.marker is not None:  # it compares whole configurations
+                if run.marker is not None:  # start() compares whole configurations
                     verb.complete(plain(fill(cfg)))
                 run.start(verb)
             if not is_dry:
                 write_hydra_files(cfg, directory)
             verb.require_files()
-            verb.complete(plain(fill(cfg)))  # before the verb imports what takes longer
+            verb.complete(plain(fill(cfg)))  # before slow imports of the verb
             collect_garbage_again()
             children_sleep()
             result = verb.run()
@@ -135,14 +134,10 @@ class Verb:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Rewrite arguments for Hydra.
+    """Rewrite overrides for Hydra.
 
-    Keys of ``data`` and ``rounds`` are forced where these come from a checkpoint, and
-    ``sweep=<file>`` sets the mode, which Hydra 1.4 needs before it composes.
-
-    Args:
-        verb: name of the verb.
-        arguments: overrides of the command line.
+    Keys of ``data`` and ``rounds`` are forced (``++``) where these nodes come from a checkpoint, and
+    ``sweep=<file>`` sets the mode, which Hydra 1.4 reads before it composes.
     """
     sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
@@ -155,16 +150,8 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
 
 
 def _help(verb: str, words: list[str], folder: str | None) -> int:
-    """Print the help of the verb, or of the groups that were named.
-
-    Args:
-        verb: name of the verb.
-        words: overrides of the command line; those without ``=`` are groups.
-        folder: of ``--config-dir``.
-
-    Returns:
-        The exit code.
-    """
+    """Print the help of the verb, or of the groups given as words without ``=``, and return the exit
+    code."""
     from ghgs_lit.cli.help import print_group, print_verb
 
     groups = [word for word in words if "=" not in word]
@@ -178,15 +165,10 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
 
 
 def _print_configuration(name: str, overrides: list[str], values: Namespace) -> None:
-    """Print what Hydra's ``--cfg job`` prints, with the defaults of options.
+    """Print the output of Hydra's ``--cfg job``, including the defaults of options.
 
-    Args:
-        name: of the verb, or the value of ``--config-name``.
-        overrides: of the command line.
-        values: of the flags ``--config-dir``, ``--package`` and ``--resolve``.
-
-    Raises:
-        InputError: the configuration has no such package, or a node has an unknown key.
+    ``name`` is the verb or the value of ``--config-name``; ``values`` holds the flags ``--config-dir``,
+    ``--package`` and ``--resolve``.
     """
     cfg = compose(name, overrides, with_hydra=True, folder=values.config_dir)
     HydraConfig.instance().set_config(cfg)
@@ -195,7 +177,7 @@ def _print_configuration(name: str, overrides: list[str], values: Namespace) -> 
         read_nodes(OmegaConf.to_container(cfg, resolve=True))
     except UnknownKey:
         raise
-    except InputError:  # a wrong value is what somebody may look for
+    except InputError:  # users may print the configuration to find a wrong value
         pass
     if values.resolve:
         OmegaConf.resolve(cfg)
@@ -207,15 +189,15 @@ def _print_configuration(name: str, overrides: list[str], values: Namespace) -> 
 
 
 def run(verb: str, argv: list[str]) -> int:
-    """Run a verb as a Hydra application; errors and interruptions are printed in one line.
+    """Run a verb as a Hydra application; errors and interruptions are printed on one line.
 
     Args:
-        verb: name of a verb.
-        argv: words of the command, program and verb first.
+        verb: Name of a verb.
+        argv: Command-line arguments, program and verb first.
 
     Returns:
-        The exit code. 0; 1: bad input; 2: bad usage; 128 + number of a signal: interrupted, such as
-        130 by Ctrl-C, or the reader of the output is gone.
+        Exit code: 0: success; 1: bad input; 2: bad usage; 128 + signal number: interrupted, such as 130
+            by Ctrl-C, or the reader of the output has closed the pipe.
     """
     # With this variable Hydra raises errors, which are handled below, instead of printing them.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
@@ -223,7 +205,7 @@ def run(verb: str, argv: list[str]) -> int:
     task = Verb(verb, tuple(argv), wants_trace)
     threading.excepthook = messages.print_of_thread
     try:
-        with interruptible():  # before errors are looked at: an interruption may look like one
+        with interruptible():  # around the handling of errors: an interruption may look like one
             flags, overrides, values = messages.parsed(argv[2:])
             if values.help:
                 return _help(verb, overrides, values.config_dir)

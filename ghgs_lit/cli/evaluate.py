@@ -1,4 +1,4 @@
-"""``ghgs evaluate``: measure a checkpoint, baselines, or both on the same targets."""
+"""``ghgs evaluate``: evaluate a checkpoint, baselines, or both on the same targets."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 
 def trained_method(run: "Evaluate", device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
-    """The model of a checkpoint with the chosen refinement, and facts about it.
+    """Model of a checkpoint with the chosen refinement, and facts about it.
 
     Args:
-        run: with a checkpoint and its model.
-        device: where the model runs.
+        run: Run with a checkpoint and its model nodes.
+        device: Device on which the model runs.
 
     Returns:
         The method, and provenance for ``metrics.json``: ``checkpoint_config``, ``model_config``,
-        ``parameters`` and, where it is known, ``training``.
+        ``parameters`` and, if known, ``training``.
 
     Raises:
-        InputError: the weights do not fit, or the renderer does not run on ``device``.
+        InputError: The weights do not fit, or the renderer does not run on ``device``.
     """
     config = run.plain
     renderer = inputs.build_renderer(run, device)
@@ -56,12 +56,12 @@ def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.devi
     """Baselines by name.
 
     Args:
-        names: one name, several, or ``all``.
-        run: with a model, for the untrained one.
-        device: where they run.
+        names: One name, several names, or ``all``.
+        run: Run with a model, for the baseline ``untrained``.
+        device: Device on which they run.
 
     Raises:
-        InputError: there is no such baseline, or the renderer does not run on ``device``.
+        InputError: There is no such baseline, or the renderer does not run on ``device``.
     """
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
     renderer = inputs.build_renderer(run, device)
@@ -73,11 +73,7 @@ def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.devi
 
 
 def _methods(run: "Evaluate", device: torch.device) -> tuple[dict[str, Method], dict[str, Any]]:
-    """The methods to measure by name, and facts about the model.
-
-    Raises:
-        InputError: there is neither checkpoint nor baseline.
-    """
+    """Methods to evaluate by name, and facts about the model."""
     path = run.checkpoint
     if path is None and not run.baselines:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
@@ -91,13 +87,10 @@ def _methods(run: "Evaluate", device: torch.device) -> tuple[dict[str, Method], 
 
 
 def run(verb: "Evaluate") -> None:
-    """Measure a checkpoint, baselines or both, and write the results.
-
-    Args:
-        verb: the run.
+    """Evaluate a checkpoint, baselines or both, and write the results.
 
     Raises:
-        InputError: the configuration, a checkpoint or the data is wrong.
+        InputError: The configuration, a checkpoint or the data is wrong.
     """
     directory = output_dir()
     verb = inputs.with_chosen_targets(inputs.with_trained_data(verb))

@@ -1,5 +1,5 @@
-"""``ghgs --help`` and ``ghgs <verb> --help [group]``: keys with meaning, default and range,
-read from the options classes."""
+"""``ghgs --help`` and ``ghgs <verb> --help [group]``: print keys with meaning, default and range, read
+from the options classes."""
 
 import json
 import textwrap
@@ -20,7 +20,7 @@ from ghgs_lit.parsing import read_text
 
 
 def usage() -> str:
-    """Every verb with its summary and an example, those of plug-ins last."""
+    """Text of ``ghgs --help``: every verb with its summary and an example, verbs of plug-ins last."""
     names = verbs()
     width = max(map(len, names))
     lines = ["usage: ghgs <verb> [key=value ...] [group=option ...] [-m]", ""]
@@ -33,11 +33,9 @@ def usage() -> str:
 
 
 def _groups(cfg: DictConfig, folder: str | None) -> dict[str, dict[str, Path]]:
-    """Files of the options of each config group by name, the chosen one's name with a ``*``.
+    """Files of each config group's options by name; the chosen name ends in ``*``.
 
-    Args:
-        cfg: what the command composes, with the node ``hydra``.
-        folder: of ``--config-dir``, if any.
+    ``cfg`` includes the node ``hydra``; ``folder`` is that of ``--config-dir``, if any.
     """
     places = [conf_dir(), *([Path(folder)] if folder is not None else [])]
     groups = {}
@@ -50,12 +48,12 @@ def _groups(cfg: DictConfig, folder: str | None) -> dict[str, dict[str, Path]]:
 
 
 def print_verb(verb: str, cfg: DictConfig, folder: str | None = None) -> None:
-    """Print what a verb does, its groups and its keys.
+    """Print the summary of a verb, its groups and its keys.
 
     Args:
-        verb: name of a verb.
-        cfg: what the command composes, with the node ``hydra``.
-        folder: of ``--config-dir``, if any.
+        verb: Name of a verb.
+        cfg: Composed configuration, including the node ``hydra``.
+        folder: Value of ``--config-dir``, if any.
     """
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
     about = verb_class(verb)
@@ -72,13 +70,13 @@ def print_group(verb: str, group: str, cfg: DictConfig, folder: str | None = Non
     """Print the keys of a group with their meaning.
 
     Args:
-        verb: name of a verb.
-        group: name of the group.
-        cfg: what the command composes, with the node ``hydra``.
-        folder: of ``--config-dir``, if any.
+        verb: Name of a verb.
+        group: Name of the group.
+        cfg: Composed configuration, including the node ``hydra``.
+        folder: Value of ``--config-dir``, if any.
 
     Raises:
-        InputError: the verb has no such group.
+        InputError: The verb has no such group.
     """
     groups = _groups(cfg, folder)
     known = list(dict.fromkeys([*groups, *(name for name in cfg if name in KINDS), "rounds"]))
@@ -99,7 +97,7 @@ def print_group(verb: str, group: str, cfg: DictConfig, folder: str | None = Non
 
 
 def _fields(cls: type[BaseModel], values: Mapping[str, Any], indent: str = "") -> Iterator[str]:
-    """Lines for the fields of a class, with the values that the command composes as defaults."""
+    """Help lines of the fields of a class, with the composed values as defaults."""
     texts = meanings(cls)
     for name, field in cls.model_fields.items():
         nested = options_of(field.annotation)

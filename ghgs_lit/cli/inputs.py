@@ -1,4 +1,4 @@
-"""Data, renderer, model of a checkpoint and device, as a verb's configuration describes them."""
+"""Build data, renderer, model of a checkpoint and device from a verb's configuration."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,48 +25,44 @@ from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
 
-if TYPE_CHECKING:  # it would import Lightning, which takes seconds
+if TYPE_CHECKING:  # importing Lightning takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
-#: Nodes of the configuration that describe the model.
+#: Configuration nodes that describe the model.
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
-#: Keys of ``data`` that describe the machine that trained, not the data.
+#: Keys of ``data`` that describe the training machine rather than the data.
 OF_MACHINE = ("cache_dir", "cache_images_mb", "packed_gb", "render_workers", "workers")
 
-#: Keys that may change in a trained model: they change neither shape nor meaning of any tensor.
+#: Keys that may change in a trained model: they affect neither shape nor meaning of any tensor.
 FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "rounds.height", "skip", "unprojection")
 FREE += ("recalibration.k", "recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 
 def build_data(run: Run) -> "PhotographsDataModule":
-    """The configured data with its view and target protocols.
-
-    Args:
-        run: of a verb with data.
+    """Build the configured data module with its view and target protocols.
 
     Raises:
-        InputError: files of the data are wrong.
+        InputError: Files of the data set are wrong.
     """
-    # Every data set has cameras that can be targets; a verb without a target protocol reads none.
+    # Any data set has cameras as possible targets; a verb without a target protocol reads no targets.
     targets = run.targets or CAMERAS
-    # of verbs that train
     extra = {} if run.augmentation is None else {"augmentation": run.augmentation}
     return run.data.build(views=run.views, targets=targets, seed=run.seed, **extra)
 
 
 def build_renderer(run: Run, device: torch.device) -> Renderer:
-    """The configured renderer.
+    """Build the configured renderer.
 
     Args:
-        run: of a verb with a renderer.
-        device: where it will run.
+        run: Run of a verb with a renderer.
+        device: Device on which it will run.
 
     Raises:
-        InputError: it does not run on ``device``.
+        InputError: The renderer does not run on ``device``.
     """
     renderer = run.renderer.build()
-    if (backend := getattr(renderer, "backend", None)) is not None:  # a plug-in's may have none
+    if (backend := getattr(renderer, "backend", None)) is not None:  # renderers of plug-ins may lack it
         resolve_backend(backend, device)
     return renderer
 
@@ -74,35 +70,35 @@ def build_renderer(run: Run, device: torch.device) -> Renderer:
 def load_predictor(
     nodes: Mapping[str, Any], checkpoint: str, device: torch.device, precision: str = "inherit"
 ) -> Predictor:
-    """The predictor of a checkpoint, in evaluation mode.
+    """Load the predictor of a checkpoint in evaluation mode.
 
     Args:
-        nodes: of the model by name as plain data, such as those of :func:`model_of`.
-        checkpoint: path of the file, or ``shipped``.
-        device: where the model will run.
-        precision: of its products.
+        nodes: Model nodes by name as plain data, such as those returned by :func:`model_of`.
+        checkpoint: Path of the file, or ``shipped``.
+        device: Device on which the model will run.
+        precision: Precision of its matrix products.
 
     Raises:
-        FileNotFoundError: there is no such checkpoint.
-        InputError: it is none of this package, or its weights do not fit the model.
+        FileNotFoundError: The checkpoint does not exist.
+        InputError: It is not a checkpoint of this package, or its weights do not fit the model.
     """
     model = GHGS.from_config(nodes, empty=True)
     load_weights(model, checkpoint, device=device)
     half = half_precision(precision, device)
     if half is not None and device.type == "cuda":
-        keep_rounded(model.encoder, half)  # a verb never changes its precision
+        keep_rounded(model.encoder, half)  # safe: a verb never changes its precision
     return Predictor(model.to(device).eval(), precision=precision)
 
 
 def check_size(data: "PhotographsDataModule", predictor: Predictor) -> None:
-    """Check the size of photographs before any is read.
+    """Check the image size before any image is read.
 
     Args:
-        data: has the size that its photographs are cropped to.
-        predictor: has the size of a patch, and how it pads.
+        data: Provides the size to which images are cropped.
+        predictor: Provides the patch size and the padding.
 
     Raises:
-        InputError: a side is no multiple of the patch.
+        InputError: A side is not a multiple of the patch size.
     """
     size = data.dataset.size
     multiple = predictor.side_multiple
@@ -113,24 +109,22 @@ def check_size(data: "PhotographsDataModule", predictor: Predictor) -> None:
 def with_trained_data(run: Measured) -> Measured:
     """Fill in the data that the checkpoint was trained on, unless ``data=<option>`` was chosen.
 
-    Given keys such as ``data.root=...`` change it; keys of the machine that trained
-    (:data:`OF_MACHINE`) have their defaults.
-
-    Args:
-        run: as composed.
+    Keys given on the command line, such as ``data.root=...``, replace those of the checkpoint; keys of
+    the training machine (:data:`OF_MACHINE`) have their defaults.
 
     Returns:
         The run with data.
 
     Raises:
-        InputError: there is no checkpoint, it stores no training data, or its folder is not here.
+        InputError: There is no checkpoint, it contains no training data, or the folder of its data does
+            not exist.
     """
     if run.data is not None:
         return run
     checkpoint = run.checkpoint
     if checkpoint is None:
         raise InputError("data: expected data=<option> where there is no checkpoint; found none")
-    if checkpoint == SHIPPED:  # its training data would have to be rendered first
+    if checkpoint == SHIPPED:  # its training data is generated and would have to be rendered first
         expected = "images=<folder> cameras=<file>, or data=<option>, with the weights of the package"
         raise InputError(f"data: expected {expected}; found neither")
     trained = read_config(checkpoint)
@@ -147,19 +141,19 @@ def with_trained_data(run: Measured) -> Measured:
 
 
 def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
-    """Model nodes of a checkpoint, with the changes of the command line.
+    """Model nodes of a checkpoint, with changes given on the command line.
 
-    The options that a verb composes by default do not count: they describe another model.
+    Options that a verb composes by default are ignored because they describe another model.
 
     Args:
-        checkpoint: path of the file, or ``shipped``.
-        run: as composed.
+        checkpoint: Path of the file, or ``shipped``.
+        run: Run as composed.
 
     Returns:
-        The nodes :data:`MODEL_NODES` and ``chosen``, as far as the checkpoint has them.
+        The nodes :data:`MODEL_NODES` and ``chosen``, as far as the checkpoint contains them.
 
     Raises:
-        InputError: it is no whole model, or the weights do not allow a change.
+        InputError: The checkpoint does not contain a whole model, or its weights do not allow a change.
     """
     trained = read_config(checkpoint)
     if trained.keys() & set(STAGES) == {"encoder"}:
@@ -183,21 +177,13 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
             OmegaConf.update(after, key, value, merge=False, force_add=True)
         else:
             _require_same(before, key, value)
-    # The height follows from the weights' training, whose photographs may have been smaller.
+    # The height depends on the training of the weights, whose images may have been smaller.
     return with_known_height(OmegaConf.to_container(after, resolve=True), trained)
 
 
 def _check_rounds(checkpoint: str, trained: Any, given: Mapping[str, Any]) -> None:
-    """Refuse keys of rounds that a checkpoint's model does not have: Hydra composes none to compare with.
-
-    Args:
-        checkpoint: path of the file, or ``shipped``.
-        trained: its node ``rounds``; None where its model has none.
-        given: keys of the command line with their values.
-
-    Raises:
-        InputError: names the key.
-    """
+    """Reject keys of ``rounds`` that the checkpoint's model does not have; Hydra composes no node to
+    compare with."""
     if not isinstance(trained, Mapping):
         expected = f"no key of rounds, as the model of {checkpoint} has none (model=recurrent has)"
         raise InputError(f"rounds.{next(iter(given))}: expected {expected}; found one")
@@ -205,16 +191,7 @@ def _check_rounds(checkpoint: str, trained: Any, given: Mapping[str, Any]) -> No
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
-    """Refuse values that differ from those the checkpoint was trained with.
-
-    Args:
-        trained: nodes of the model as plain data.
-        key: dotted key or group of an override.
-        value: what the override composes, as plain data; keys of :data:`FREE` below it may differ.
-
-    Raises:
-        InputError: names the first key that differs.
-    """
+    """Reject values that differ from those of training; keys of :data:`FREE` may differ."""
     for name, wanted in flatten(value, key).items():
         before = lookup(trained, name)
         same = before == wanted or is_below(name, FREE)
@@ -222,14 +199,7 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
 
 
 def _require_ablation(trained: Mapping[str, Any]) -> None:
-    """Refuse another ``ablation`` than the trained one; its switches can be set one by one instead.
-
-    Args:
-        trained: configuration of the checkpoint as plain data.
-
-    Raises:
-        InputError: another one was chosen.
-    """
+    """Reject another ``ablation`` than that of training; its switches can be set one by one instead."""
     before = ablation_of(trained)
     wanted = HydraConfig.get().runtime.choices["ablation"]
     switches = "recalibration.neighborhood=... and .similarity=... act"
@@ -237,13 +207,10 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
 
 
 def with_chosen_targets(run: Measured) -> Measured:
-    """Measure only the protocol of ``targets=<option>``, if given without ``evaluation.targets``.
-
-    Args:
-        run: as composed.
+    """Evaluate only the protocol of ``targets=<option>`` if it is given without ``evaluation.targets``.
 
     Returns:
-        The run, with ``evaluation.targets`` where it is so.
+        The run, with ``evaluation.targets`` set accordingly.
     """
     keys = given_keys()
     if "targets" not in keys or is_below("evaluation.targets", keys):
@@ -252,13 +219,13 @@ def with_chosen_targets(run: Measured) -> Measured:
 
 
 def pick_device(name: str) -> torch.device:
-    """The device of a verb.
+    """Device of a verb.
 
     Args:
-        name: cpu, cuda, or auto: CUDA, else the CPU.
+        name: ``cpu``, ``cuda``, or ``auto``: CUDA if available, otherwise the CPU.
 
     Raises:
-        InputError: there is no CUDA device.
+        InputError: CUDA is requested but not available.
     """
     there = torch.cuda.is_available()
     require(there or name != "cuda", "device", "auto or cpu on a machine without CUDA", name)
@@ -266,12 +233,12 @@ def pick_device(name: str) -> torch.device:
 
 
 def choices() -> dict[str, str]:
-    """Chosen option of each config group in this run; empty outside of Hydra."""
+    """Chosen option of each config group in this run; empty outside Hydra."""
     return dict(HydraConfig.get().runtime.choices) if HydraConfig.initialized() else {}
 
 
 def overrides() -> list[str]:
-    """Overrides of the command line or the sweep in this run; empty outside of Hydra."""
+    """Overrides of the command line or the sweep in this run; empty outside Hydra."""
     return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 

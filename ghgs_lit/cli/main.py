@@ -12,16 +12,9 @@ from ghgs_lit.runtime.cores import spin_if_alone
 
 
 def _command(argv: list[str]) -> int:
-    """Run a command.
-
-    Args:
-        argv: its words, program first.
-
-    Returns:
-        The exit code, as of :func:`main`.
-    """
+    """Run a command and return the exit code, see :func:`main`."""
     if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
-        from ghgs_lit.cli.help import usage  # here: it loads pydantic
+        from ghgs_lit.cli.help import usage  # here: imports pydantic
 
         print(usage())
         return 0 if len(argv) > 1 else 2
@@ -44,12 +37,12 @@ def _command(argv: list[str]) -> int:
             f"ghgs: .: expected a working directory (cd to another); found {error.strerror}", file=sys.stderr
         )
         return 1
-    from ghgs_lit.cli.application import run  # here: it loads Hydra
+    from ghgs_lit.cli.application import run  # here: imports Hydra
 
     return run(argv[1], argv)
 
 
-#: Files of this distribution's packages begin so.
+#: Path prefix of the files of this distribution's packages.
 _OURS = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "ghgs_")
 _THEIRS = warnings.formatwarning
 
@@ -57,21 +50,22 @@ _THEIRS = warnings.formatwarning
 def _text_of_warning(
     message: Warning, category: type, filename: str, lineno: int, line: str | None = None
 ) -> str:
-    """Text of a warning, as ``warnings.formatwarning``: of ours a line without the place in the code."""
+    """Text of a warning, like ``warnings.formatwarning``; for warnings of this distribution one line
+    without the code location."""
     if category is UserWarning and os.path.abspath(filename).startswith(_OURS):
         return f"warning: {message}\n"
     return _THEIRS(message, category, filename, lineno, line)
 
 
 def main() -> int:
-    """The console script.
+    """Run the console script.
 
     Returns:
-        The exit code. 0; 1: bad input; 2: bad usage; 130, 143: interrupted.
+        Exit code: 0: success; 1: bad input; 2: bad usage; 130, 143: interrupted.
     """
     argv = list(sys.argv)
     warnings.formatwarning = _text_of_warning
-    # Schedulers and daemons may have closed them.
+    # Schedulers and daemons may have closed standard output and error.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115

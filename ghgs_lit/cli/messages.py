@@ -25,18 +25,18 @@ from ghgs_lit.config.options import UnknownKey, did_you_mean
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.errors import InputError, require
 
-#: Errors that are bad input, not bugs.
+#: Errors that indicate bad input rather than a bug.
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster"}
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
-#: Hydra would write .hydra through links;
-#: :func:`ghgs_lit.cli.application.write_hydra_files` does not.
+#: Keeps Hydra from writing .hydra, which it does through links;
+#: :func:`ghgs_lit.cli.application.write_hydra_files` replaces it.
 NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
 
-#: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
+#: Nodes of Lightning's classes; their keys have defaults, so they may be deleted.
 _LIGHTNING = ("trainer", "callbacks", "logger")
 
 
@@ -44,8 +44,8 @@ def one_line(error: Exception, verb: str) -> str:
     """Message of an error on one line.
 
     Args:
-        error: one of :data:`BAD_INPUT`, or an error inside Hydra.
-        verb: name of the verb, whose keys are known.
+        error: One of :data:`BAD_INPUT`, or an error raised inside Hydra.
+        verb: Name of the verb; its keys are suggested for misspelt ones.
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
@@ -61,15 +61,15 @@ def one_line(error: Exception, verb: str) -> str:
         text = _unknown_key(error.key, verb)
     elif isinstance(error, InputError):
         text = str(error)
-    else:  # an error of Hydra that does not name the override
+    else:  # an error of Hydra without the name of the override
         text = _no_name_of_an_option()
         text = text or f"{_command_line()}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
 
 
 def _no_name_of_an_option() -> str | None:
-    """Message for the first group whose option is given as a number or as null, such as ``views=4``,
-    of which Hydra's error names neither group nor value; None: there is none."""
+    """Message for the first group whose option is a number or null, such as ``views=4``: Hydra's error
+    contains neither group nor value. None if there is no such override."""
     for word in sys.argv[1:]:
         group, _, value = word.partition("=")
         if (conf_dir() / group).is_dir() and re.fullmatch(r"[\d.,]+|null", value):
@@ -95,7 +95,7 @@ def _unread_override(error: OverrideParseException) -> str:
 
 
 def _missing_option(error: MissingConfigException) -> str:
-    """Message for an unknown group or option; Hydra's own lists the whole search path."""
+    """Message for an unknown group or option, in place of Hydra's, which lists the whole search path."""
     group, _, option = error.missing_cfg_file.rpartition("/")
     if not group:
         return f"--config-name: expected a configuration of the search path; found {option!r}"
@@ -107,12 +107,7 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _composition(error: HydraException, verb: str) -> str:
-    """Message for a key that does not exist, with the closest one, or for another error of Hydra.
-
-    Args:
-        error: of the composition.
-        verb: name of the verb, whose keys are known.
-    """
+    """Message for an unknown key, with the closest known one, or for another composition error of Hydra."""
     if chosen := re.match(r"In '([^']+)': Could not override 'ablation'", str(error)):
         expected = "no choice of an ablation, which composes last (ablation=... on the command line)"
         return f"{chosen[1]}: expected {expected}; found one"
@@ -126,14 +121,15 @@ def _composition(error: HydraException, verb: str) -> str:
 
 
 def _unknown_key(key: str, verb: str) -> str:
-    """Message for a key that does not exist, with the closest one.
+    """Message for an unknown key, with the closest known one.
 
-    A word is compared with words, never with a whole dotted key, whose group would make all keys
-    of it alike. A group of another name is mended first: ``optimzer.lrr`` is looked for in ``optimizer``.
+    A name is compared with names only, never with a whole dotted key, because a shared group would make
+    all its keys similar. A misspelt group is corrected first: ``optimzer.lrr`` is looked up in
+    ``optimizer``.
     """
     text = f"{key}: expected a key or group of this verb; found none of that name"
     if any(key in verb_class(name).model_fields for name in verbs()):
-        return text  # of another verb
+        return text  # it belongs to another verb
     groups = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
     chosen = [word for word in sys.argv[1:] if word.partition("=")[0] in groups and "," not in word]
     keys = _keys(verb, chosen) or _keys(verb)
@@ -142,7 +138,7 @@ def _unknown_key(key: str, verb: str) -> str:
     if dot:
         group = "".join(difflib.get_close_matches(group, names, 1)) or group
         known_as = {known.removeprefix(f"{group}."): known for known in keys}
-    else:  # a key without its group is close, too: lr for optimizer.lr
+    else:  # also match a key without its group: lr for optimizer.lr
         rest = key
         known_as = {known.rpartition(".")[2]: known for known in keys} | {name: name for name in names}
     close = difflib.get_close_matches(rest, known_as, 1)
@@ -150,7 +146,7 @@ def _unknown_key(key: str, verb: str) -> str:
 
 
 def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
-    """All dotted keys of a verb with some overrides; none where it cannot be composed so."""
+    """All dotted keys of a verb with some overrides; empty if the configuration cannot be composed."""
     try:
         return list(flatten(OmegaConf.to_container(compose(verb, overrides), resolve=False)))
     except (HydraException, OmegaConfBaseException, InputError):
@@ -158,9 +154,9 @@ def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
 
 
 def _system(error: OSError) -> str:
-    """Message for a file that cannot be read or written;
-    the run's directory if the error names none."""
-    if error.errno is None:  # raised by this package, with a whole message
+    """Message for a file that cannot be read or written; with the run's directory if the error contains
+    no path."""
+    if error.errno is None:  # raised by this package with a complete message
         return str(error)
     path = error.filename2 or error.filename
     if path is None:
@@ -174,21 +170,17 @@ def _system(error: OSError) -> str:
 
 
 def print_of_thread(arguments: threading.ExceptHookArgs) -> None:
-    """Print the error of a thread, unless it is a full disk: TensorBoard's raises it again where it logs.
+    """Exception hook of threads: print the error unless the disk is full.
 
-    Args:
-        arguments: of :func:`threading.excepthook`.
+    TensorBoard's writer thread raises such an error again where values are logged.
     """
     if getattr(arguments.exc_value, "errno", None) not in _FULL:
         threading.__excepthook__(arguments)
 
 
 def raised_by_hydra(error: Exception) -> bool:
-    """Whether an error concerns the command line: raised in Hydra's code, or by its YAML.
-
-    Args:
-        error: with its traceback.
-    """
+    """Whether an error concerns the command line: raised in Hydra's or OmegaConf's code, or by the YAML
+    parser."""
     if isinstance(error, YAMLError):
         return True
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
@@ -196,7 +188,7 @@ def raised_by_hydra(error: Exception) -> bool:
 
 
 class BadUsage(Exception):
-    """A flag that Hydra does not have."""
+    """Unknown flag, or a flag without its value."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -208,32 +200,32 @@ def parsed(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Nam
     """Split the arguments of a verb.
 
     Args:
-        arguments: words of the command line after the verb.
+        arguments: Command-line arguments after the verb.
 
     Returns:
-        Hydra's flags, which must stand before all overrides; the overrides; and the flags' values.
+        Hydra's flags, which must precede all overrides; the overrides; and the values of the flags.
 
     Raises:
-        BadUsage: a flag is unknown, or lacks its value.
+        BadUsage: A flag is unknown or lacks its value.
     """
     parser = get_args_parser()
     parser.__class__ = _Parser
     values = parser.parse_intermixed_args(list(arguments))
-    if values.shell_completion:  # Hydra's calls the program without its verb
+    if values.shell_completion:  # Hydra's completion calls the program without its verb
         parser.error("--shell-completion: ghgs has none")
     flags = [word for word in arguments if word not in values.overrides]
     return flags, values.overrides, values
 
 
 def check_directory(arguments: Sequence[str], sweeps: bool) -> None:
-    """Refuse a directory that Hydra ignores: of a single run in a sweep, or the reverse.
+    """Reject a directory that Hydra ignores: that of a single run in a sweep, or vice versa.
 
     Args:
-        arguments: overrides of the command line.
-        sweeps: whether the command is a sweep.
+        arguments: Overrides of the command line.
+        sweeps: Whether the command is a sweep.
 
     Raises:
-        InputError: the directory of the other mode alone is given.
+        InputError: Only the directory of the other mode is given.
     """
     given = dict(text.lstrip("+").split("=", 1) for text in arguments if "=" in text)
     names = ["hydra.run.dir", "hydra.sweep.dir"]
@@ -243,13 +235,10 @@ def check_directory(arguments: Sequence[str], sweeps: bool) -> None:
 
 
 def check_deletions(arguments: Sequence[str]) -> None:
-    """Refuse to delete a key or group that the package reads (``~data.size``).
-
-    Args:
-        arguments: overrides of the command line.
+    """Reject deletions of keys or groups that the package reads, such as ``~data.size``.
 
     Raises:
-        InputError: names the first such key.
+        InputError: The message contains the first such key.
     """
     for key in (text[1:].split("=", 1)[0] for text in arguments if text.startswith("~")):
         if key in _LIGHTNING or not is_below(key, _LIGHTNING):

@@ -1,4 +1,4 @@
-"""``ghgs prepare``: render people or scans into training data, or check a data set."""
+"""``ghgs prepare``: render people or scans as training data, or check a data set."""
 
 import logging
 from pathlib import Path
@@ -21,11 +21,8 @@ log = logging.getLogger(__name__)
 def run(verb: "Prepare") -> None:
     """Render or check a data set.
 
-    Args:
-        verb: the run.
-
     Raises:
-        InputError: the configuration or the data is wrong.
+        InputError: The configuration or the data is wrong.
     """
     data = verb.data.build(views=verb.views, targets=verb.targets, seed=verb.seed)
     root = resolved(data.dataset.root or ".")
@@ -37,13 +34,13 @@ def run(verb: "Prepare") -> None:
 
 
 def render(data: PhotographsDataModule) -> None:
-    """Render what is missing, then check that it can be read.
+    """Render missing subjects, then check that all can be read.
 
     Args:
-        data: its data set makes itself.
+        data: Data module of a data set that can be rendered.
 
     Raises:
-        InputError: what it is made of, or what is there, is wrong.
+        InputError: The source of the data set or an existing file is wrong.
     """
     data.dataset.make()
     for phase in PHASES:
@@ -51,15 +48,15 @@ def render(data: PhotographsDataModule) -> None:
 
 
 def check(data: PhotographsDataModule, folder: Path, expected: Check) -> None:
-    """Read all data once, print what was found, and write ``check.json``.
+    """Read all data once, print the findings, and write ``check.json``.
 
     Args:
-        data: what is read.
-        folder: for the file.
-        expected: limits of good data.
+        data: Data to check.
+        folder: Folder for ``check.json``.
+        expected: Limits of good data.
 
     Raises:
-        InputError: something is missing or broken.
+        InputError: Something is missing or broken.
     """
     report = inspect(data, expected.min_iou, expected.min_agreement)
     report.show()

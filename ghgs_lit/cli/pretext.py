@@ -18,17 +18,14 @@ from ghgs_lit.training.pretext import Pretext, PretextModule
 
 
 def run(verb: Training) -> float | str | None:
-    """Train the branch.
-
-    Args:
-        verb: the run.
+    """Train the semantic branch.
 
     Returns:
-        Part accuracy on validation people, 0 to 1; in a sweep ``job.BUSY`` where another process
-        works on the run.
+        Part accuracy on validation people, 0 to 1; in a sweep ``job.BUSY`` if another process has locked
+        the run.
 
     Raises:
-        Interrupted: by Ctrl-C or SIGTERM.
+        Interrupted: By Ctrl-C or SIGTERM.
     """
     return run_job(verb, RunDirectory(output_dir()), pretrain)
 
@@ -37,18 +34,18 @@ def pretrain(run: Training, directory: Path, stats: dict[str, Any]) -> float | N
     """Train the branch and save it.
 
     Args:
-        run: as configured.
-        directory: the run's.
-        stats: receives the ``steps`` and ``seconds`` of this training.
+        run: Configuration of the run.
+        directory: Directory of the run.
+        stats: Receives the ``steps`` and ``seconds`` of this training.
 
     Returns:
         Part accuracy on validation people, 0 to 1.
 
     Raises:
-        InputError: the encoder has no branch,
-            or the size of photographs is no multiple of its patch.
+        InputError: The encoder has no semantic branch, or the image size is not a multiple of its patch
+            size.
     """
-    # Tables of models that start from this checkpoint show this origin.
+    # Shown in tables as the origin of models that start from this checkpoint.
     run = run.changed(encoder={"weights": "pretext"})
     options = run.encoder.semantic
     patch_size = run.encoder.patch_size

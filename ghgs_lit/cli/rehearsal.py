@@ -1,4 +1,4 @@
-"""Check for ``dry_run`` everything that runs need before their first step."""
+"""Checks of ``dry_run``: everything that runs require before their first step."""
 
 import re
 import tempfile
@@ -28,14 +28,8 @@ if TYPE_CHECKING:
 
 
 def rehearse(runs: Sequence["Train"]) -> Rehearsal:
-    """Check what runs need, each configuration once. Nothing is rendered or written, and no step is taken.
-
-    Args:
-        runs: as configured.
-
-    Returns:
-        Reasons and notes.
-    """
+    """Check the prerequisites of runs, each configuration once; renders and writes nothing and takes no
+    step."""
     findings = _Findings()
     distinct = {config_hash({**run.plain, "seed": 0}): run for run in runs}
     quiet()
@@ -47,16 +41,16 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
 
 
 class _Findings:
-    """Reasons and notes, as keys in order of appearance."""
+    """Reasons and notes, stored as keys in order of appearance."""
 
     def __init__(self) -> None:
         self.reasons: dict[str, None] = {}
         self.notes: dict[str, None] = {}
-        #: Whether all files exist, by data and phase, which several configurations share.
+        #: Whether all files exist, by (hash of data, phase); configurations may share data.
         self.complete: dict[tuple[str, str], bool] = {}
 
     def attempt(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        """The result of a call; None where it raises an error of its input, which becomes a reason."""
+        """Result of a call; None if it raises an input error, which becomes a reason."""
         try:
             return function(*arguments, **named)
         except (InputError, OSError) as error:
@@ -64,7 +58,7 @@ class _Findings:
             return None
 
     def check(self, run: "Train", folder: Path) -> None:
-        """Build what a run would use; loggers write to ``folder``."""
+        """Build everything that a run uses; loggers write to ``folder``."""
         self.attempt(job.check_config, run)
         if run.resume not in (None, "auto"):
             self.attempt(read_checkpoint, run.resume)
@@ -90,13 +84,13 @@ class _Findings:
             self.notes |= {} if needed is None else {needed: None}
 
     def check_data(self, run: "Train", data: "PhotographsDataModule") -> bool:
-        """Note what is missing of the data of a run; whether its files exist."""
+        """Record missing data of a run and return whether all files exist."""
         split = run.evaluation.split
         dataset = data.dataset
         if hasattr(dataset, "cache_dir") and not _is_rendered(data, {"train", "val", split}):
             self.notes[f"data={dataset.name}: people are rendered before the first step"] = None
             return False
-        chamfer = getattr(getattr(run.loss, "weights", None), "chamfer", None)  # a plug-in's may have none
+        chamfer = getattr(getattr(run.loss, "weights", None), "chamfer", None)  # plug-ins may lack it
         expected = f"expected body vertices for loss.weights.chamfer={chamfer} (0 does without); found none"
         keys = [(config_hash(run.plain["data"], without=()), phase) for phase in ("train", split)]
         for key in keys:
@@ -108,7 +102,7 @@ class _Findings:
                 self.complete[key] = lines == []
         if not all(self.complete.get(key, True) for key in keys):
             return False
-        batch = self.attempt(data.training_batch, 0)  # reads the content of the files
+        batch = self.attempt(data.training_batch, 0)  # also reads the contents of files
         self.attempt(check_evaluation, run, data)
         if chamfer and batch is not None and batch.body_vertices is None:
             place = data.photographs("train").reader.body_place(batch.subjects[0])
@@ -117,7 +111,8 @@ class _Findings:
 
 
 def _find_missing_files(dataset: "DataSet", phase: str, bodies: str | None) -> list[str]:
-    """A line for each file that a phase lacks; ``bodies`` reports a missing body, None: none is needed."""
+    """One line for each missing file of a phase; ``bodies`` is the message for a missing body, None: no
+    body is required."""
     reader = dataset.reader(phase, strict=False)
     lines = list(reader.problems)
     for name in reader.subjects:
@@ -136,7 +131,7 @@ def _find_missing_files(dataset: "DataSet", phase: str, bodies: str | None) -> l
 
 
 def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
-    """Whether all these splits have subjects that can be read."""
+    """Whether each of these splits has readable subjects."""
     try:
         return all(bool(data.subjects(split)) for split in splits)
     except (InputError, OSError):
@@ -144,11 +139,8 @@ def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
 
 
 def _summarize(lines: Iterable[str]) -> list[str]:
-    """The first of lines that differ in numbers alone, with how many more there are.
-
-    Args:
-        lines: such as ``img/0001.png: expected a file; found none``.
-    """
+    """Keep the first of lines that differ only in numbers, with the number of similar ones, such as
+    ``img/0001.png: expected a file; found none``."""
     alike: dict[str, list[str]] = {}
     for line in lines:
         alike.setdefault(re.sub(r"\d+", "#", line), []).append(line)
@@ -159,13 +151,10 @@ def _summarize(lines: Iterable[str]) -> list[str]:
 
 
 def plan(run: "Train") -> None:
-    """Print the plan of a single run, as of :func:`ghgs_lit.runs.plan.print_plan`.
-
-    Args:
-        run: as configured.
+    """Print the plan of a single run, see :func:`ghgs_lit.runs.plan.print_plan`.
 
     Raises:
-        InputError: something is missing.
+        InputError: Something is missing.
     """
     directory = RunDirectory(output_dir()).of(run)
     item = PlannedRun(directory.path.name, (), tuple(overrides()), run, directory)

@@ -1,4 +1,5 @@
-"""What all verbs share: the run's directory, its saved configuration and the path printed last."""
+"""Functions shared by all verbs: the run's directory, its saved configuration, output files and the path
+printed last."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,40 +14,36 @@ from ghgs_lit.files import require_free, resolved, write_text_atomically
 
 
 def output_dir() -> Path:
-    """Absolute path of this run's directory, which Hydra makes."""
+    """Absolute path of the run's directory, which Hydra creates."""
     return resolved(HydraConfig.get().runtime.output_dir)
 
 
 def write_config(run: Run, directory: Path) -> None:
     """Write ``directory/config.yaml`` and print its path.
 
-    Args:
-        run: its configuration.
-        directory: the run's.
-
     Raises:
-        InputError: another program's file is there.
+        InputError: The file exists and was written by another program.
     """
     path = directory / "config.yaml"
     is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
     require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")
     write_text_atomically(path, saved_text(run.plain))
     overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    words = " ".join(text.removeprefix("++") for text in overrides)  # which the command line forces
+    words = " ".join(text.removeprefix("++") for text in overrides)  # ++ is added by ghgs
     print(f"config: {path} ({words or 'no overrides'})", flush=True)
 
 
 def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path] = ()) -> dict[str, Path]:
-    """Paths of the files that keys of a verb name, by key, without those that are null.
+    """Paths of the output files of a verb by key, without keys that are null.
 
     Args:
-        options: keys of the verb, ``overwrite`` among them.
-        keys: those that name files.
-        read: files that the verb reads.
+        options: Keys of the verb, including ``overwrite``.
+        keys: Keys that hold paths of output files.
+        read: Files that the verb reads.
 
     Raises:
-        InputError: a file exists and ``overwrite`` is false, it is one of ``read``, or two
-            keys name one.
+        InputError: A file exists and ``overwrite`` is false, it is one of ``read``, or two keys have the
+            same path.
     """
     named = {key: getattr(options, key) for key in keys}
     paths = {key: Path(path).expanduser() for key, path in named.items() if path is not None}
@@ -59,5 +56,5 @@ def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path
 
 
 def announce(path: Path | str) -> None:
-    """Print the path of the results, as the last line of a verb."""
+    """Print the path of the results as the last line of a verb's output."""
     print(f"wrote {path}", flush=True)

@@ -1,4 +1,4 @@
-"""``ghgs table``: show the runs below a directory as one of the paper's tables."""
+"""``ghgs table``: format the runs below a directory as one of the paper's tables."""
 
 import re
 from pathlib import Path
@@ -15,17 +15,9 @@ if TYPE_CHECKING:
 
 
 def _listed(options: Options, key: str) -> tuple | None:
-    """The values of a key that holds one or a list.
+    """Values of a key that holds one value or a list, None if there are none; rejects repeated values.
 
-    Args:
-        options: have the key.
-        key: dotted key; its last part is the field.
-
-    Returns:
-        The values; None: there are none.
-
-    Raises:
-        InputError: one is there twice.
+    ``key`` is dotted; its last part is the field.
     """
     value = getattr(options, key.rpartition(".")[2])
     values = (value,) if isinstance(value, str | int) else tuple(value or ())
@@ -34,7 +26,7 @@ def _listed(options: Options, key: str) -> tuple | None:
 
 
 def _expression(key: str, text: str) -> re.Pattern[str]:
-    """A regular expression of a key, compiled; InputError: it is none."""
+    """Compile the regular expression of a key."""
     try:
         return re.compile(text)
     except re.error as error:
@@ -42,14 +34,7 @@ def _expression(key: str, text: str) -> re.Pattern[str]:
 
 
 def _options(run: "Table") -> t.TableOptions:
-    """What tables are built by.
-
-    Args:
-        run: as configured.
-
-    Raises:
-        InputError: ``test.unit`` is no regular expression with a group, or a value is there twice.
-    """
+    """Options for building tables; checks regular expressions and repeated values."""
     unit = _expression("test.unit", run.test.unit or "(.+)")
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
@@ -67,16 +52,13 @@ def _options(run: "Table") -> t.TableOptions:
 def run(verb: "Table") -> None:
     """Print the tables and write them as CSV, LaTeX and Markdown.
 
-    Args:
-        verb: the run.
-
     Raises:
-        InputError: a key, a run or a file of other methods is wrong.
+        InputError: A key, a run or a file with results of other methods is wrong.
     """
     directory = output_dir()
     write_config(verb, directory)
     options = _options(verb)
-    # Resolved: a run that is found by two paths counts once.
+    # Resolved, so that a run found by two paths counts once.
     folders = [resolved(path) for path in _listed(verb, "runs") or ()]
     others = [t.read_others(Path(p).expanduser()) for p in _listed(verb, "others") or ()]
     sweep = t.read_sweep(folders, _listed(verb, "by") or ())

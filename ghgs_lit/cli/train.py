@@ -1,4 +1,4 @@
-"""``ghgs train``: train a model, then measure it."""
+"""``ghgs train``: train a model, then evaluate it."""
 
 import logging
 import os
@@ -48,8 +48,7 @@ if TYPE_CHECKING:
 
 
 def quiet() -> None:
-    """Silence Lightning's log lines, which Hydra would print twice,
-    and warnings that do not apply here."""
+    """Silence Lightning's log messages, which Hydra would print twice, and warnings that do not apply."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
@@ -62,15 +61,15 @@ def prepare_start(run: "Train", module: GHGSModule, directory: Path) -> int | No
     """Load ``init_from`` or ``resume``.
 
     Args:
-        run: names them.
-        module: gets the weights.
-        directory: the run's; what was loaded is listed in its ``init_from.txt``.
+        run: Configuration of the run.
+        module: Receives the weights.
+        directory: Directory of the run; its ``init_from.txt`` lists what was loaded.
 
     Returns:
-        The step to resume at; None: a new run.
+        Step to resume at; None: a new run.
 
     Raises:
-        InputError: both are given, or the checkpoint does not fit.
+        InputError: Both are given, or the checkpoint does not fit.
     """
     start.check_start(run, directory)
     path = run.init_from
@@ -87,14 +86,14 @@ def resume_step(run: "Training", module: L.LightningModule) -> int | None:
     """Load the weights of ``resume``.
 
     Args:
-        run: names the checkpoint.
-        module: gets the weights.
+        run: Configuration of the run.
+        module: Receives the weights.
 
     Returns:
-        The step to resume at; None: a new run.
+        Step to resume at; None: a new run.
 
     Raises:
-        InputError: the checkpoint does not fit.
+        InputError: The checkpoint does not fit.
     """
     if run.resume is None:
         return None
@@ -105,15 +104,15 @@ def resume_step(run: "Training", module: L.LightningModule) -> int | None:
 
 
 def build_trainer(run: Run, directory: Path, *further: Callback) -> L.Trainer:
-    """The Trainer with the configured loggers and callbacks.
+    """Build the Trainer with the configured loggers and callbacks.
 
     Args:
-        run: with the groups ``trainer``, ``logger`` and ``callbacks``.
-        directory: the run's; loggers and callbacks write below it.
-        *further: callbacks that come before the configured ones.
+        run: Run with the groups ``trainer``, ``logger`` and ``callbacks``.
+        directory: Directory of the run, below which loggers and callbacks write.
+        *further: Callbacks that precede the configured ones.
 
     Raises:
-        InputError: it refuses its options.
+        InputError: The Trainer rejects its options.
     """
     logs = [options.build(save_dir=str(directory)) for options in run.logger.values()]
     callbacks = [*further, *(options.build() for options in run.callbacks.values())]
@@ -128,16 +127,16 @@ def build_trainer(run: Run, directory: Path, *further: Callback) -> L.Trainer:
 
 
 def environments() -> list[ClusterEnvironment]:
-    """Plugins of the Trainer for a job of SLURM.
+    """Cluster plugins of the Trainer in a SLURM job.
 
-    Tasks of ``srun`` are the processes of a training, those of a batch script are not.
+    Tasks of ``srun`` are processes of the training; those of a batch script are not.
 
     Raises:
-        InputError: ``srun`` was started with other tasks.
+        InputError: Lightning rejects the options with which ``srun`` was started.
     """
     if "SLURM_NTASKS" not in os.environ or "TORCHELASTIC_RUN_ID" in os.environ:
         return []
-    # this package stops, saves and queues again: Lightning's own checkpoint may lie within a step
+    # This package stops, saves and requeues: a checkpoint by Lightning might be saved within a step.
     try:
         return [SLURMEnvironment(auto_requeue=False) if in_srun() else LightningEnvironment()]
     except RuntimeError as error:
@@ -145,18 +144,15 @@ def environments() -> list[ClusterEnvironment]:
 
 
 def run(verb: "Train") -> float | str | None:
-    """Train and measure a run; in a sweep unless it is done.
-
-    Args:
-        verb: the run.
+    """Train and evaluate a run; in a sweep, unless it is done.
 
     Returns:
-        Mean PSNR of the first protocol in dB; in a sweep ``job.BUSY`` where another process
-        works on the run.
+        Mean PSNR of the first protocol in dB; in a sweep ``job.BUSY`` if another process has locked the
+        run.
 
     Raises:
-        InputError: the configuration, a checkpoint or the data is wrong.
-        Interrupted: by Ctrl-C or SIGTERM.
+        InputError: The configuration, a checkpoint or the data is wrong.
+        Interrupted: By Ctrl-C or SIGTERM.
     """
     job.check_config(verb)
     if job.in_sweep():
@@ -169,15 +165,15 @@ def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float
     """Train a run, alone or as one of several processes.
 
     Args:
-        run: as configured.
-        directory: of the run.
-        train: trains and measures; returns the metric.
+        run: Configuration of the run.
+        directory: Directory of the run.
+        train: Trains and evaluates; returns the metric.
 
     Returns:
-        As :func:`ghgs_lit.runs.job.train_once`.
+        See :func:`ghgs_lit.runs.job.train_once`.
 
     Raises:
-        Interrupted: by Ctrl-C or a signal of a batch system; how to go on is printed.
+        Interrupted: By Ctrl-C or a signal of a batch system; how to continue is printed.
     """
     is_first = settle_rank(run.trainer) == 0
     try:
@@ -194,18 +190,18 @@ def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float
 
 
 def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train, save the last weights and measure them.
+    """Train, save the final weights and evaluate them.
 
     Args:
-        run: as configured.
-        directory: the run's.
-        stats: receives the ``steps`` and ``seconds`` of this training.
+        run: Configuration of the run.
+        directory: Directory of the run.
+        stats: Receives the ``steps`` and ``seconds`` of this training.
 
     Returns:
         Mean PSNR of the first protocol in dB; None in all processes but the first.
 
     Raises:
-        InputError: the configuration, a checkpoint or the data is wrong.
+        InputError: The configuration, a checkpoint or the data is wrong.
     """
     if rank_zero_only.rank == 0:
         write_config(run, directory)
@@ -214,11 +210,11 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     model = GHGS.from_config(run.plain)
     renderer = run.renderer.build()
     losses = run.loss.build()
-    data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
+    data.trains_on_depths &= getattr(losses, "reads_depths", True)  # losses of plug-ins may lack it
     module = GHGSModule(model, renderer, losses, run.optimizer.build(), run.plain, run.token_budgets)
     check_size(data, module.predictor)
     step = prepare_start(run, module, directory)
-    if run.feature_cache is not None:  # of verbs that train the whole model
+    if run.feature_cache is not None:  # None for verbs that do not train the whole model
         run.feature_cache.attach(model, data)
     run = start.with_origin(run, model)
     module.config = {**module.config, **run.plain}
@@ -226,7 +222,7 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     cost = TrainingCost()
     trainer = build_trainer(run, directory, cost, StopAtStep(), NeighborsAtStart())
     module.metrics = run.metrics.build().to(trainer.strategy.root_device)
-    # The last check, because it makes missing photographs.
+    # The last check, because it renders missing images.
     check_evaluation(run, data)
     try:
         fit(trainer, module, data, run.resume, step, stats)
@@ -257,25 +253,25 @@ def fit(
     """Train a module.
 
     Args:
-        trainer: trains it.
-        module: its weights are those of ``resume``, if any.
-        data: of the training.
-        resume: the checkpoint, if any.
-        step: where it stands; None: a new run.
-        stats: receives ``steps``, those taken here, and ``seconds``,
-            even if training is interrupted.
+        trainer: Trains the module.
+        module: Already has the weights of ``resume``, if any.
+        data: Data of the training.
+        resume: Checkpoint to resume from, if any.
+        step: Step of that checkpoint; None: a new run.
+        stats: Receives ``steps``, those of this call, and ``seconds``, even if training is
+            interrupted.
 
     Raises:
-        InputError: options of the Trainer do not fit the data, or ``resume`` the optimizer.
+        InputError: Options of the Trainer do not fit the data, or ``resume`` does not fit the optimizer.
     """
     loggers.begin(trainer.loggers, saved_text(module.config), step)
     started = time.perf_counter()
     try:
         trainer.fit(module, data, ckpt_path=resume and file_of(resume))
-    except MisconfigurationException as error:  # of options that do not fit the data
+    except MisconfigurationException as error:  # raised for options that do not fit the data
         raise InputError(f"trainer: {error}") from None
     except Exception as error:
-        # Lightning reads the state of a training, which may be damaged, before it loads data.
+        # Lightning reads the training state, which may be damaged, before it creates data loaders.
         if resume is None or trainer.train_dataloader is not None or isinstance(error, InputError):
             raise
         found = f"{type(error).__name__}: {error}".splitlines()[0]
@@ -295,15 +291,15 @@ def measure_last(
     directory: Path,
     training: dict[str, Any],
 ) -> float:
-    """Measure the last weights and write the results, on disk and to the loggers.
+    """Evaluate the final weights and write the results to disk and to the loggers.
 
     Args:
-        trainer: has trained the module.
-        module: its model is measured, and put into evaluation mode.
-        data: gives the batches of the evaluation.
-        run: as configured.
-        directory: the run's.
-        training: facts about the training: ``steps``, ``seconds``, ``peak_bytes``, ``processes``.
+        trainer: Trainer that has trained the module.
+        module: Its model is evaluated and left in evaluation mode.
+        data: Provides the batches of the evaluation.
+        run: Configuration of the run.
+        directory: Directory of the run.
+        training: Facts about the training: ``steps``, ``seconds``, ``peak_bytes``, ``processes``.
 
     Returns:
         Mean PSNR of the first protocol in dB.

@@ -1,8 +1,8 @@
-"""A verb of ``ghgs`` is one class: its summary, an example, its keys, and what it does.
+"""Base classes of the verbs of ``ghgs``: a verb's summary, an example, its keys, and its work.
 
 The fields of a verb are the keys that ``conf/<verb>.yaml`` sets in addition to its groups, whose options
 are its attributes (:class:`ghgs_lit.config.run.Run`). All verbs are registered in
-:mod:`ghgs_lit.config.registry`, those of this distribution like those of a plug-in.
+:mod:`ghgs_lit.config.registry`, those of this distribution in the same way as those of a plug-in.
 """
 
 import os
@@ -18,48 +18,46 @@ from ghgs_lit.config.run import Run
 
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["inherit", "float32", "tf32", "bfloat16", "float16", "auto"]
-#: One entry of ``token_budgets``.
+#: Entry of ``token_budgets``.
 Budget = Literal["all", "window"] | Patches
 Budgets = Annotated[tuple[Budget, ...], Field(min_length=1)]
 
 
 class Verb(Run):
-    """Base of all verbs; the first line of the docstring is the summary that
-    ``ghgs --help`` prints."""
+    """Base of all verbs; the first line of a verb's docstring is its summary in ``ghgs --help``."""
 
     work: ClassVar[str] = ""
-    """Import path of the function that does the work; a verb without one defines :meth:`run`."""
+    """Import path of the function that does the work; a verb without one overrides :meth:`run`."""
     example: ClassVar[str] = ""
-    """A command, for ``ghgs --help``."""
+    """Example command for ``ghgs --help``."""
     opens: ClassVar[tuple[str, ...]] = ()
-    """Keys whose checkpoints must exist."""
+    """Keys of checkpoints that must exist."""
     reads_data: ClassVar[bool] = False
-    """Whether it reads a data set without making it, so that the folder must exist."""
+    """Whether the verb reads a data set without creating it, so that its folder must exist."""
     has_trained_data: ClassVar[bool] = False
-    """Whether the data comes from the checkpoint where no ``data=<option>`` is chosen."""
+    """Whether the data is that of the checkpoint if no ``data=<option>`` is chosen."""
     begins_run: ClassVar[bool] = False
-    """Whether its directory becomes that of a run at once,
-    before a run of others gets files of this one."""
+    """Whether the directory becomes a run's and is checked before any file is written, so that another
+    run never receives files of this one."""
 
     @classmethod
     def summary(cls) -> str:
-        """What the verb does, in one line."""
+        """One-line description of the verb."""
         return (cls.__doc__ or "").partition("\n")[0].rstrip(".")
 
     def require_files(self) -> None:
-        """Check that the files of the verb exist, before anything is imported that takes seconds.
+        """Check that the input files of the verb exist, before imports that take seconds.
 
         Raises:
-            FileNotFoundError, InputError: a file or folder is missing or wrong;
-                the message is its reader's.
+            FileNotFoundError, InputError: A file or folder is missing or wrong.
         """
-        from ghgs_lit.parsing import require_folder  # here: --help needs no NumPy
+        from ghgs_lit.parsing import require_folder  # here: --help does not need NumPy
         from ghgs_lit.weights.reading import require_weights
 
         for key in self.opens:
             if getattr(self, key) not in (None, "auto"):
                 require_weights(getattr(self, key))
-        data = self.plain.get("data")  # which is not checked yet
+        data = self.plain.get("data")  # not validated yet
         is_read = self.reads_data and isinstance(data, Mapping) and not data.get("source")
         if is_read and isinstance(data.get("root"), str):
             require_folder(Path(os.path.expanduser(data["root"])))
@@ -68,29 +66,28 @@ class Verb(Run):
         """Do the work of the verb.
 
         Returns:
-            A number that a sweeper optimises, if any.
+            A number for a sweeper to optimize, if any.
         """
         return import_object(self.work)(self)
 
 
 class Measured(Verb):
-    """Keys of verbs that run a model."""
+    """Base of verbs that run a model."""
 
     device: Device = "auto"
-    """auto: CUDA where there is one."""
+    """Device; auto: CUDA if available, otherwise the CPU."""
     precision: Precision = "inherit"
-    """Of the model's matrix products; inherit: of its weights and inputs."""
+    """Precision of the model's matrix products; inherit: that of its weights and inputs."""
     seed: Seed = 1
-    """Of the data's random choices and of random weights."""
+    """Seed of random choices of data and of random weights."""
 
 
 class Training(Verb):
-    """Keys of verbs that train."""
+    """Base of verbs that train."""
 
     seed: Seed = 1
-    """Of weights, of samples and of their order."""
+    """Seed of the weights, the samples and their order."""
     resume: Literal["auto"] | PathText | None = "auto"
-    """A checkpoint to go on from; auto: where the run in the directory stands;
-    null: begins anew."""
+    """Checkpoint to resume from; auto: continue the run in the directory, if any; null: start anew."""
     overwrite: bool = False
-    """Delete the run that is in the directory already."""
+    """Delete the run that the directory already contains."""

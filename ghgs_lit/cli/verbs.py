@@ -1,6 +1,7 @@
-"""The verbs of the framework: what each is for, its keys, and where its work begins.
+"""The verbs of the framework: their summaries, keys and entry points.
 
-The module that does the work is imported when the verb runs: ``ghgs --help`` waits for no library.
+The module that does the work is imported only when the verb runs, so that ``ghgs --help`` imports no
+large library.
 """
 
 from typing import Annotated, Literal
@@ -22,18 +23,17 @@ class Train(Training):
     reads_data = True
 
     token_budgets: Budgets | None = None
-    """What the encoder sees in a training step, drawn from this list: all, window (around the
-    subject), or a number (patches around the subject that stay). One checkpoint then serves all
-    presets of skip."""
+    """Tokens that the encoder receives in a training step, sampled from this list: all, window (around
+    the subject), or a number (patches kept around the subject). One checkpoint then serves all presets of
+    skip."""
     init_from: PathText | None = None
-    """A checkpoint whose weights to start from."""
+    """Checkpoint whose weights to start from."""
     init_strict: bool = False
-    """Whether all weights of init_from must fit,
-    and be all that the model has (or all of its encoder)."""
+    """Whether all weights of init_from must fit and cover the whole model (or its whole encoder)."""
     allow_random_encoder: bool = False
-    """Whether an encoder that does not learn may be random, to try things out."""
+    """Allow random weights in an encoder that is not trained, for experiments."""
     dry_run: bool = False
-    """Print what would be run, how long it takes and where it goes, and run nothing."""
+    """Print which runs would start, their duration and their output paths, and run nothing."""
 
     def run(self) -> object:
         if self.dry_run:
@@ -53,7 +53,7 @@ class Pretext(Training):
 
 
 class Evaluate(Measured):
-    """Measure a checkpoint or the baselines."""
+    """Evaluate a checkpoint or the baselines."""
 
     work = "ghgs_lit.cli.evaluate.run"
     example = "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt"
@@ -62,60 +62,59 @@ class Evaluate(Measured):
     has_trained_data = True
 
     checkpoint: PathText | None = None
-    """A checkpoint; null: baselines alone."""
+    """Checkpoint to evaluate; null: baselines only."""
     refine_cameras: int = Field(0, ge=0, le=100)
-    """Rounds, at most, that correct the inputs' cameras before each prediction; 0: none."""
+    """Maximum number of rounds that correct the input cameras before each prediction; 0: none."""
     refine: int = Field(0, ge=0, le=10000)
-    """Steps of optimisation towards the inputs after each prediction; 0: none."""
+    """Optimization steps towards the input views after each prediction; 0: none."""
     baselines: Texts = ()
-    """Of black, nearest_view, body_depth, hull, photo_depth, true_depth, per_scene, untrained;
-    or all."""
+    """Baselines, from black, nearest_view, body_depth, hull, photo_depth, true_depth, per_scene,
+    untrained; or all."""
     per_scene: PerScene = PerScene()
-    """3D Gaussian splatting on each subject's inputs."""
+    """3D Gaussian splatting optimized on each subject's input views."""
 
 
 class Benchmark(Measured):
-    """Run time against error of the presets of skip, by stage."""
+    """Compare run time and error of the presets of skip, by stage."""
 
     work = "ghgs_lit.cli.benchmark.run"
     example = "ghgs benchmark checkpoint=runs/train/.../checkpoints/last.ckpt presets=[none,exact,balanced]"
 
     checkpoint: PathText | None = None
-    """null: random weights, of which only run times and differences mean something."""
+    """Checkpoint to run; null: random weights, for which only run times and differences are meaningful."""
     presets: Annotated[tuple[Text, ...], Field(min_length=1)] = ("none", "exact", "balanced", "fast")
-    """Names of files of conf/skip; none, which the others are compared with, is always measured,
-    too."""
+    """Names of files in conf/skip; none, the reference, is always measured."""
     knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
-    """Lists of values by key, such as {recalibration.k: [4, 8]}: each preset is measured with every
+    """Lists of values by key, such as {recalibration.k: [4, 8]}; each preset is measured with every
     combination."""
     split: Literal["train", "val", "bench", "sealed"] = "val"
-    """bench, sealed: frozen people of data=synthetic."""
+    """Split of the data; bench, sealed: fixed people of data=synthetic."""
     subjects: Count | None = 4
-    """Number of subjects, the first of the split, rounded up to whole batches; null: all."""
+    """Number of subjects, taken from the start of the split and rounded up to whole batches; null: all."""
     timing: Timing = Timing()
-    """How times are taken."""
+    """How run times are measured."""
     threads: int | None = Field(None, ge=1, le=1024)
-    """Threads of PyTorch, of which no machine has more than 1024; null: as many as it chooses."""
+    """Threads of PyTorch, at most 1024; null: PyTorch's default."""
 
 
 class Stress(Verb):
-    """Every stage on adversarial inputs, against float64."""
+    """Test every stage on adversarial inputs against float64."""
 
     work = "ghgs_lit.cli.stress.run"
     example = "ghgs stress quick=true"
 
     quick: bool = False
-    """Some thousand cases within a minute."""
+    """Run some thousand cases within a minute."""
     stages: tuple[Text, ...] | None = None
-    """Names of stages, as a run prints them; null: all."""
+    """Names of stages, as printed by a run; null: all."""
     families: tuple[Text, ...] | None = None
-    """Names of families of inputs, as stress.md lists them; null: all."""
+    """Names of families of inputs, as listed in stress.md; null: all."""
     workers: Workers | None = None
-    """Processes; null: one for each processor, 0: this one."""
+    """Number of processes; null: one per processor; 0: this process."""
 
 
 class Table(Verb):
-    """Collect a sweep into the paper's table."""
+    """Collect the runs of a sweep into one of the paper's tables."""
 
     work = "ghgs_lit.cli.table.run"
     example = "ghgs table runs=runs/train/sweep_..."
@@ -123,76 +122,73 @@ class Table(Verb):
     runs: Annotated[
         PathText | Annotated[tuple[PathText, ...], Field(min_length=1)], Words("a path or a list of paths")
     ]
-    """The directory of a sweep, or a list of directories."""
+    """Directory of a sweep, or a list of directories."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"
     """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF
     methods | table4: the paper's ablation."""
     columns: Texts | None = None
-    """Metrics, such as [psnr_box, ssim_box];
-    null: psnr, ssim, lpips (flip where a run has no lpips)."""
+    """Metrics, such as [psnr_box, ssim_box]; null: psnr, ssim, lpips (flip where a run lacks lpips)."""
     by: Texts = ()
-    """Configuration keys whose values get rows of their own, such as [optimizer.lr]."""
+    """Configuration keys whose values get separate rows, such as [optimizer.lr]."""
     subjects: Text | None = None
-    """A regular expression: subjects whose whole names match are shown,
-    such as a.* (people in action); null: all."""
+    """Regular expression; only subjects whose whole name matches are included, such as a.* (people in
+    action); null: all."""
     others: PathText | tuple[PathText, ...] = ()
     """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
     reported: bool = True
-    """Also print the paper's own numbers (not with layout=ablation)."""
+    """Also print the numbers reported in the paper (not with layout=ablation)."""
     test: PairedTest = PairedTest()
-    """The test between rows."""
+    """Significance test between rows."""
 
 
 class Prepare(Verb):
-    """Render scans into training data, or make the built-in people."""
+    """Render scans as training data, or create the built-in people."""
 
     work = "ghgs_lit.cli.prepare.run"
     example = "ghgs prepare task=render data=scans data.source=scans data.root=rendered"
 
     task: Literal["render", "check"] = "render"
-    """render: render what is missing. check: read every photograph and camera once."""
+    """render: render missing subjects. check: read every image and camera once."""
     check: Check = Check()
-    """What task=check expects of data."""
+    """Limits of good data for task=check."""
     seed: Seed = 0
-    """Of the samples that task=check draws."""
+    """Seed of the samples that task=check reads."""
 
 
 class Import(Verb):
-    """Published weights to a checkpoint."""
+    """Convert published weights to a checkpoint."""
 
     work = "ghgs_lit.cli.weights.run_import"
     example = "ghgs import vggt=facebook/VGGT-1B release=release.pth out=release.ckpt"
 
     vggt: PathText | None = None
-    """facebook/VGGT-1B, or its file (.safetensors or .pt)."""
+    """facebook/VGGT-1B, or its weights file (.safetensors or .pt)."""
     release: PathText | None = None
-    """The authors' checkpoint; null: the file holds the encoder alone,
-    for init_from of a training."""
+    """The authors' checkpoint; null: the file contains only the encoder, for init_from of a training."""
     out: PathText
-    """File of the checkpoint."""
+    """Path of the checkpoint to write."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
-    """Of the encoder in the checkpoint; the heads are float32."""
+    """Data type of the encoder in the checkpoint; the heads are float32."""
     overwrite: bool = False
-    """Replace a file that exists."""
+    """Replace an existing file."""
 
 
 class Export(Verb):
-    """A checkpoint to a small one for prediction, or to the published names."""
+    """Convert a checkpoint to a small one for prediction, or to the published format."""
 
     work = "ghgs_lit.cli.weights.run_export"
     example = "ghgs export checkpoint=checkpoints/last.ckpt inference=small.ckpt"
     opens = ("checkpoint",)
 
     checkpoint: PathText
-    """A checkpoint of ``ghgs train`` or ``ghgs import``."""
+    """Checkpoint of ``ghgs train`` or ``ghgs import``."""
     vggt: PathText | None = None
     """File for the encoder, .safetensors or .pt; null: not written."""
     release: PathText | None = None
     """File for all other stages, .pth; null: not written."""
     inference: PathText | None = None
-    """File with weights and configuration alone, a checkpoint for ``ghgs predict``;
-    null: not written."""
+    """File with only weights and configuration, a checkpoint for ``ghgs predict``; null: not written."""
     dtype: Literal["float16", "bfloat16", "float32"] = "float16"
-    """Of the weights in it."""
+    """Data type of the weights in the inference file."""
     overwrite: bool = False
-    """Replace files that exist."""
+    """Replace existing files."""

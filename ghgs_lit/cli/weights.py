@@ -1,4 +1,4 @@
-"""``ghgs import`` and ``ghgs export``: published weights to a checkpoint of this package and back."""
+"""``ghgs import`` and ``ghgs export``: convert published weights to a checkpoint and back."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -22,28 +22,25 @@ from ghgs_lit.weights.switches import differences
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Export, Import
 
-_PATCHES = 8  # along each side of the photographs on which two models are compared
+_PATCHES = 8  # patches along each side of the images on which two models are compared
 
 
 def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
-    """Tensors that published weights fill, on the meta device.
+    """Tensors to fill with published weights, on the meta device.
 
     Args:
-        config: the nodes of the model as plain data.
-        release: the authors' checkpoint; None: the tensors of the encoder alone.
+        config: Model nodes as plain data.
+        release: The authors' checkpoint; None: only the tensors of the encoder.
     """
     state = GHGS.from_config(config, empty=True).state_dict()
     return {name: tensor for name, tensor in state.items() if release or name.startswith("encoder.")}
 
 
 def run_import(verb: "Import") -> None:
-    """Write the checkpoint, and print what it was made of.
-
-    Args:
-        verb: the run.
+    """Write the checkpoint, and print a report of its origin.
 
     Raises:
-        InputError: the weights do not fit the model, or the file exists.
+        InputError: The weights do not fit the model, or the file exists.
     """
     write_config(verb, output_dir())
     config = verb.plain
@@ -59,14 +56,14 @@ def run_import(verb: "Import") -> None:
 
 @torch.no_grad()
 def parity(checkpoint: str, exported: str) -> dict[str, float]:
-    """Differences between the predictions of two checkpoints for photographs of a noisy ellipsoid.
+    """Differences between the predictions of two checkpoints on images of a noisy ellipsoid.
 
     Args:
-        checkpoint: what the other one is compared with.
-        exported: the other one.
+        checkpoint: Reference checkpoint.
+        exported: Checkpoint to compare.
 
     Returns:
-        As :func:`ghgs_lit.diagnostics.benchmark.measure.differences`.
+        See :func:`ghgs_lit.diagnostics.benchmark.measure.differences`.
     """
     results = []
     batch = None
@@ -81,13 +78,10 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
 
 
 def run_export(verb: "Export") -> None:
-    """Write the files that were asked for, and print how they differ from the checkpoint.
-
-    Args:
-        verb: the run.
+    """Write the requested files, and print how they differ from the checkpoint.
 
     Raises:
-        InputError: no file is asked for, one exists, or the checkpoint is wrong.
+        InputError: No file is requested, a file exists, or the checkpoint is wrong.
     """
     write_config(verb, output_dir())
     checkpoint = verb.checkpoint

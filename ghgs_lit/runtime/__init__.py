@@ -1,2 +1,1 @@
-"""The process and its machine: memory, cores, precision of products, changes of parameters,
-recorded work."""
+"""The process and its machine: memory, CPU cores and watchers of stages."""

@@ -1,6 +1,8 @@
-"""Watchers of the stages of a model: when each begins and ends, its inputs and its result. The
-model has no code for this: stages that are modules get hooks, others are wrapped while they
-are watched."""
+"""Watchers of a model's stages: observe their start and end, inputs and results.
+
+The model contains no code for this: modules get forward hooks, other stages are wrapped while they are
+watched.
+"""
 
 import time
 from collections import defaultdict
@@ -12,44 +14,44 @@ from typing import Any
 import torch
 from torch import nn
 
-#: A point in time: seconds on the CPU, an event on CUDA.
+#: Point in time: seconds on the CPU, an event on CUDA.
 Mark = float | torch.cuda.Event
 #: Positional and named arguments of a stage.
 Inputs = tuple[tuple, dict[str, Any]]
 
 
 class Watcher:
-    """Is called when stages begin and end, also nested ones; subclasses override what they need."""
+    """Base class with callbacks at the start and end of stages, including nested ones."""
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs | None:
-        """A stage begins.
+        """Called when a stage begins.
 
         Args:
-            stage: its name.
-            inputs: positional and named arguments.
+            stage: Name of the stage.
+            inputs: Positional and keyword arguments.
 
         Returns:
-            Inputs that replace its own; None: they stay.
+            Inputs that replace the original ones; None: keep them.
         """
 
     def end(self, stage: str, result: Any = None) -> None:
-        """A stage ends.
+        """Called when a stage ends.
 
         Args:
-            stage: its name.
-            result: what it returned.
+            stage: Name of the stage.
+            result: Return value of the stage.
         """
 
 
 @contextmanager
 def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
-    """Call a watcher at every call of stages while the context lasts.
+    """Call a watcher at every call of the stages while the context is active.
 
     Args:
-        model: whose stages are watched.
-        stages: from names for the watcher to dotted paths in ``model``; a stage that is None or
-            missing is left out.
-        watcher: is called.
+        model: Model that contains the stages.
+        stages: Dotted paths in ``model`` by the names passed to the watcher; stages that are None or
+            missing are skipped.
+        watcher: Watcher to call.
     """
     with ExitStack() as stack:
         for name, path in stages.items():
@@ -67,12 +69,7 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
 
 @contextmanager
 def inside(stage: str, watcher: Watcher) -> Iterator[None]:
-    """Call ``watcher`` for a stage that lasts as long as the context.
-
-    Args:
-        stage: its name.
-        watcher: is called.
-    """
+    """Report the body of the context to ``watcher`` as a stage."""
     watcher.begin(stage)
     yield
     watcher.end(stage)
@@ -86,7 +83,7 @@ def _hooks(stage: nn.Module, name: str, watcher: Watcher) -> tuple:
 
 
 class Wrapped:
-    """A stage that is no module, with a watcher of its calls."""
+    """A watched stage that is not a module."""
 
     def __init__(self, stage: Any, name: str, watcher: Watcher):
         self._stage = stage
@@ -105,7 +102,7 @@ class Wrapped:
 
 
 def time_mark(device: torch.device) -> Mark:
-    """The present time on ``device``; on CUDA, when the work submitted so far is done."""
+    """Current time on ``device``; on CUDA the time when all work submitted so far has finished."""
     if device.type != "cuda":
         return time.perf_counter()
     event = torch.cuda.Event(enable_timing=True)
@@ -114,17 +111,12 @@ def time_mark(device: torch.device) -> Mark:
 
 
 def seconds_between(begin: Mark, end: Mark) -> float:
-    """Seconds between two marks.
-
-    Args:
-        begin: of :func:`time_mark`.
-        end: of the same device; both have been reached.
-    """
+    """Seconds between two marks of :func:`time_mark` on the same device; both must have been reached."""
     return end - begin if isinstance(begin, float) else begin.elapsed_time(end) / 1e3
 
 
 class Stopwatch(Watcher):
-    """Total time of the calls of each stage on ``device``, by events on CUDA."""
+    """Watcher that measures the total time of each stage on ``device``, with events on CUDA."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -138,7 +130,7 @@ class Stopwatch(Watcher):
         self._spans.append((stage, self._open.pop(), time_mark(self.device)))
 
     def seconds(self) -> dict[str, float]:
-        """Seconds of each stage, in the order of their first ends; waits for the device."""
+        """Seconds of each stage, in the order in which they first ended; synchronizes with the device."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         total: dict[str, float] = defaultdict(float)
