@@ -100,7 +100,7 @@ def _rows_of_gaussians(
 
     Args:
         prediction: each of its valid pixels has a Gaussian; a shape bucket may be filled up with
-            copies of the preceding Gaussian.
+            Gaussians of the preceding pixel.
         used: pixels to use.
 
     Returns:

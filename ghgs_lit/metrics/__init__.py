@@ -1,4 +1,4 @@
-"""Metrics: pure functions, and protocols that name what is reported."""
+"""Image and geometry metrics: pure functions, and named protocols that compute them."""
 
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import PSNR_CAP, depth_error_mm, psnr, ssim, surface_error_mm

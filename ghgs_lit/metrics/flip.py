@@ -1,4 +1,4 @@
-"""FLIP: a perceptual image difference that needs no trained weights.
+"""FLIP, a perceptual image difference without trained weights.
 
 P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A
 Difference Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's.
@@ -17,8 +17,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import correlate
 
 PIXELS_PER_DEGREE = 67.0206
-"""Resolution in the eye of the paper's viewer:
-0.7 m away from a screen 0.7 m wide with 3840 pixels."""
+"""Resolution seen by the paper's viewer, 0.7 m from a screen that is 0.7 m and 3840 pixels wide."""
 
 # Contrast sensitivity as sums of Gaussians (table 1):
 # amplitude and width for each opponent channel.
@@ -39,7 +38,7 @@ def _transform_colors(image: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _xyz_matrices(like: Tensor) -> tuple[Tensor, Tensor]:
-    """The matrix to XYZ divided by the white point, and its inverse."""
+    """Matrix to XYZ relative to the white point, and its inverse."""
     matrix = torch.tensor(_RGB_TO_XYZ, dtype=torch.float64)
     relative = matrix / matrix.sum(1, keepdim=True)
     return relative.to(like), torch.linalg.inv(relative).to(like)
@@ -51,7 +50,7 @@ def _linear_rgb(image: Tensor) -> Tensor:
 
 
 def _opponent(xyz: Tensor) -> Tensor:
-    """XYZ relative to white to YCxCz (a linear CIELab)."""
+    """Convert XYZ relative to white to YCxCz (a linear CIELab)."""
     x, y, z = xyz.split(1, dim=1)
     return torch.cat((116 * y - 16, 500 * (x - y), 200 * (y - z)), dim=1)
 
@@ -62,8 +61,8 @@ def _from_opponent(ycc: Tensor) -> Tensor:
 
 
 def _hunt_lab(xyz: Tensor) -> Tensor:
-    """XYZ relative to white to CIELab with chroma scaled by lightness (Hunt effect,
-    section 4.1.3)."""
+    """Convert XYZ relative to white to CIELab with chroma scaled by lightness (Hunt effect, section
+    4.1.3)."""
     delta = 6 / 29
     root = torch.where(xyz > delta**3, xyz.clamp(min=delta**3) ** (1 / 3), xyz / (3 * delta**2) + 4 / 29)
     x, y, z = root.split(1, dim=1)
@@ -84,8 +83,8 @@ def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
 
 
 def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
-    """Blur each channel of YCxCz [n, 3, h, w] as the eye does at ``ppd`` pixels a degree
-    (section 4.1.1)."""
+    """Filter each channel of YCxCz [n, 3, h, w] by the contrast sensitivity of the eye at ``ppd`` pixels
+    per degree (section 4.1.1)."""
     widest = max(b for _, b in itertools.chain.from_iterable(_SENSITIVITY.values()))
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * ppd)
     x = torch.arange(-radius, radius + 1, dtype=ycc.dtype, device=ycc.device) / ppd
@@ -108,7 +107,7 @@ def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor
     to_xyz, to_rgb = _xyz_matrices(first)
 
     def perceived(ycc: Tensor) -> Tensor:
-        """Colours that the eye sees."""
+        """Perceived colours, as Hunt-adjusted CIELab."""
         rgb = _transform_colors(_from_opponent(_filter_sensitivity(ycc, ppd)), to_rgb).clamp(0, 1)
         return _hunt_lab(_transform_colors(rgb, to_xyz))
 
@@ -121,14 +120,7 @@ def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor
 
 
 def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
-    """Strength of edges and of points in lightness.
-
-    Args:
-        lightness: [n, 1, h, w] in [0, 1].
-        ppd: pixels per degree.
-
-    Returns:
-        Two maps [n, h, w]: edges and points (section 4.2)."""
+    """Strength of edges and of points [n, h, w] in lightness [n, 1, h, w] in [0, 1] (section 4.2)."""
     sigma = 0.5 * _FEATURE_WIDTH * ppd
     radius = math.ceil(3 * sigma)
     x = torch.arange(-radius, radius + 1, dtype=lightness.dtype, device=lightness.device)
@@ -152,8 +144,8 @@ def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) 
 
     Returns:
         Maps in [0, 1], 0 where the images are equal."""
-    # Images one by one: rounding can depend on the position in memory,
-    # and equal images must give 0.
+    # Image and target separately, not as one batch: rounding can depend on the position in memory, and
+    # equal images must give 0.
     with exact(image.device.type):
         image = at_least_float32(image).clamp(0, 1)
         target = at_least_float32(target).clamp(0, 1)

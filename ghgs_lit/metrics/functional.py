@@ -1,7 +1,7 @@
-"""Image metrics as pure functions: one value for each RGB image in [0, 1] (data range 1).
+"""Metrics as pure functions: one value per RGB image in [0, 1] (data range 1).
 
-A region (:mod:`ghgs_lit.metrics.regions`) selects the pixels that count. Where it is empty the
-value is nan, and averages leave it out."""
+A region (:mod:`ghgs_lit.metrics.regions`) selects pixels. If it is empty the value is nan, which
+averages ignore."""
 
 import torch
 import torch.nn.functional as F
@@ -16,15 +16,13 @@ from ghgs_lit.metrics.regions import box_of, grown, mean_inside, mean_over
 
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
-"""PSNR in dB of equal images, and the largest value reported:
-float32 resolves no smaller errors."""
+"""Largest PSNR in dB, that of equal images: float32 does not resolve smaller errors."""
 BESIDE = 3
-"""Rows or columns from the subject's outline beyond which :func:`spill` counts."""
+"""Rows or columns from the subject's outline beyond which :func:`spill` measures."""
 INNER = 4
-"""Least rows and columns from the subject's outline of what :func:`sharpness` counts."""
+"""Least distance in rows and columns from the subject's outline of pixels in :func:`sharpness`."""
 BRIGHTNESS = 0.40
-"""Mean of the subject in the images that :func:`psnr_box_40` compares:
-that of well lit photographs."""
+"""Mean of the subject to which :func:`psnr_box_40` scales images, as in well lit photographs."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 """Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
@@ -32,25 +30,13 @@ SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 def squared_error(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
 ) -> Float[Tensor, "n h w"]:
-    """Squared error of each pixel, averaged over the channels.
-
-    Args:
-        image: renders.
-        target: images in [0, 1].
-
-    Returns:
-        Maps in float32 or wider."""
+    """Squared error of each pixel, averaged over the channels, in float32 or wider."""
     return (at_least_float32(image) - at_least_float32(target)).square().mean(1)
 
 
 def decibels(mse: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """PSNR of a mean squared error.
-
-    Args:
-        mse: for a data range of 1.
-
-    Returns:
-        ``-10 log10(MSE)``, at most :data:`PSNR_CAP`; nan stays nan."""
+    """PSNR of a mean squared error for a data range of 1: ``-10 log10(MSE)``, at most
+    :data:`PSNR_CAP`; nan stays nan."""
     return -10 * mse.clamp(min=10 ** (-PSNR_CAP / 10)).log10()
 
 
@@ -64,21 +50,20 @@ def psnr(
     Args:
         image: renders.
         target: images in [0, 1].
-        region: the pixels that count; None: all.
+        region: pixels to average over; None: all.
 
     Returns:
-        dB for each image, at most :data:`PSNR_CAP`; nan where the region is empty."""
+        dB per image, at most :data:`PSNR_CAP`; nan if the region is empty."""
     return decibels(mean_over(squared_error(image, target), region))
 
 
 def psnr_box_40(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, " n"]:
-    """PSNR in the subject's box of images that are scaled so that the subject's mean is
-    :data:`BRIGHTNESS`.
+    """PSNR in the subject's box of images scaled to a mean of :data:`BRIGHTNESS` over the subject.
 
-    Errors grow with light: the same prediction of a person lit twice as brightly has 6 dB less.
-    Scaled, dark and bright people can be compared. Values above 1 stay.
+    Errors are proportional to brightness: the same prediction of a person lit twice as brightly has
+    6 dB less. Scaling makes dark and bright people comparable. Values above 1 are not clamped.
 
     Args:
         image: renders.
@@ -86,14 +71,14 @@ def psnr_box_40(
         mask: of the subject.
 
     Returns:
-        dB for each image, at most :data:`PSNR_CAP`; nan where the subject is empty or black."""
+        dB per image, at most :data:`PSNR_CAP`; nan if the subject is empty or black."""
     light = mean_over(at_least_float32(target).mean(1), mask)
     gain = torch.where(light > 0, BRIGHTNESS / light, torch.nan)
     return decibels(mean_over(squared_error(image, target), box_of(mask)) * gain.square())
 
 
 def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
-    """Weights of SSIM's window along one side, with sum 1."""
+    """Weights of SSIM's window along one axis, with sum 1."""
     x = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - (SSIM_WINDOW - 1) / 2
     weights = torch.exp(-x.square() / (2 * SSIM_SIGMA**2))
     return weights / weights.sum()
@@ -102,18 +87,15 @@ def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
 def correlate(
     maps: Float[Tensor, "n c h w"], along_y: Float[Tensor, " ky"], along_x: Float[Tensor, " kx"]
 ) -> Float[Tensor, "n c hh ww"]:
-    """Filter every map with a separable kernel, without padding.
+    """Filter every map with a separable kernel, without padding: maps shrink by the kernels' lengths
+    minus 1.
 
     Args:
-        maps: to filter.
-        along_y: kernel along columns.
-        along_x: kernel along rows.
-
-    Returns:
-        Maps smaller by the kernels' lengths minus 1."""
+        maps: maps to filter.
+        along_y: vertical kernel.
+        along_x: horizontal kernel."""
     n, c, h, w = maps.shape
-    # All maps are channels of one depthwise convolution:
-    # ten times faster on a CPU than a batch of maps.
+    # One depthwise convolution with all maps as channels: ten times faster on a CPU than as a batch.
     flat = maps.reshape(1, n * c, h, w)
     flat = F.conv2d(flat, along_y.expand(n * c, 1, -1)[..., None].contiguous(), groups=n * c)
     flat = F.conv2d(flat, along_x.expand(n * c, 1, 1, -1).contiguous(), groups=n * c)
@@ -123,20 +105,21 @@ def correlate(
 def ssim_map(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], padding: str = "valid"
 ) -> Float[Tensor, "n c hh ww"]:
-    """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider.
+    """Structural similarity (Wang et al., 2004), K = 0.01, 0.03, moments in float32 or wider.
 
     Args:
         image: renders.
         target: images in [0, 1].
-        padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image
-            averages these); the others keep the image's size: ``reflect`` mirrors the image at its
-            border (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
+        padding: ``valid``: only pixels whose window lies inside the image (scikit-image averages
+            these); the others keep the image's size: ``reflect`` mirrors it at its border
+            (torchmetrics), ``zeros`` pads it with black (the authors' evaluation).
 
     Returns:
         The similarity of each window in [-1, 1].
 
     Raises:
-        InputError: images smaller than the window, unless padded with zeros; no such padding."""
+        InputError: the images are smaller than the window and not padded with zeros, or ``padding``
+            is unknown."""
     choice("ssim.padding", padding, PADDINGS)
     found = tuple(image.shape[-2:])
     large = padding == "zeros" or min(found) >= SSIM_WINDOW
@@ -169,10 +152,10 @@ def ssim(
         image: renders.
         target: images in [0, 1].
         padding: as in :func:`ssim_map`.
-        region: the pixels that count, where the map covers them; None: all.
+        region: pixels to average over, as far as the map covers them; None: all.
 
     Returns:
-        The mean over channels and pixels of each image; nan where the region is empty.
+        The mean over channels and pixels of each image; nan if the region is empty.
 
     Raises:
         InputError: as :func:`ssim_map`."""
@@ -182,7 +165,7 @@ def ssim(
 def spill(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, " n"]:
-    """Light that is rendered outside the subject, farther than :data:`BESIDE` pixels from its mask.
+    """Light rendered outside the subject, farther than :data:`BESIDE` pixels from its mask.
 
     Args:
         image: renders on black.
@@ -190,7 +173,7 @@ def spill(
         mask: of the subject.
 
     Returns:
-        Per mille of the subject's light in the target; nan where that has none."""
+        Per mille of the subject's light in the target; nan if that is 0."""
     drawn = at_least_float32(image).clamp(min=0).mean(1)
     true = at_least_float32(target).mean(1)
     light = torch.where(mask, true, 0).sum((-2, -1))
@@ -209,8 +192,8 @@ def sharpness(
         mask: of the subject.
 
     Returns:
-        The energy over the target's: 1 is right, less is blurred, more is ragged; nan where the
-        target has none."""
+        The energy relative to the target's: 1 is ideal, less is blurred, more is noisy; nan if the
+        target's is 0."""
     inner = (mask & ~grown(~mask, INNER))[:, 1:-1, 1:-1]
     with exact(image.device.type):
         energies = []
@@ -230,36 +213,36 @@ def depth_error_mm(
 
     Args:
         depth: predicted, in metres.
-        truth: in metres; 0 is unknown.
-        region: the pixels that count.
+        truth: in metres; 0: unknown.
+        region: pixels to average over.
 
     Returns:
-        Millimetres; nan if no pixel counts.
+        Millimetres; nan without such pixels.
 
     Raises:
-        InputError: depths of different shapes."""
+        InputError: the depths differ in shape."""
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()
 
 
-#: Opacity from which on a Gaussian stands for the surface.
+#: Least opacity of Gaussians that represent the surface.
 _OPAQUE = 0.5
 
 
 def surface_error_mm(
     means: Float[Tensor, "n 3"], opacities: Float[Tensor, " n"], surface: Float[Tensor, "m 3"]
 ) -> Float[Tensor, ""]:
-    """Distance of Gaussians to the surface, and of the surface to the nearest Gaussian;
-    the mean of both.
+    """Mean of two distances: from Gaussians to the surface, and from the surface to the nearest opaque
+    Gaussian.
 
-    It sees where Gaussians end, after all offsets, where :func:`depth_error_mm` ends before them;
-    points of the surface are about a pixel apart, and so is the least value.
+    Unlike :func:`depth_error_mm`, it measures Gaussians after all offsets. Points of the surface are
+    about a pixel apart, which limits the least value.
 
     Args:
-        means: of Gaussians, in metres; those that are not finite are left out.
-        opacities: in [0, 1], by which distances to the surface are weighted; those to a Gaussian
-            are to one of opacity 0.5 or more.
+        means: centres of Gaussians in metres; those that are not finite are left out.
+        opacities: in [0, 1], the weights of distances to the surface; distances from the surface are
+            to Gaussians with an opacity of 0.5 or more.
         surface: points, in metres.
 
     Returns:

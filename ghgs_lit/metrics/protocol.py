@@ -1,4 +1,4 @@
-"""A measuring protocol: which metrics are computed, how, and under which names."""
+"""Measuring protocols: which metrics are computed, how, and under which names."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -28,14 +28,13 @@ from ghgs_lit.metrics.regions import DEPTH_STEP, EDGE, mean_inside, region_of
 NETWORK = "vgg"
 
 _ALL = ("psnr", "ssim", "flip")
-#: Metrics of each region; SSIM and FLIP look at windows,
-#: which single pixels of a region do not fill.
+#: Metrics of each region; SSIM and FLIP use windows, which thin regions do not fill.
 MEASURED = {"image": _ALL, "box": _ALL, "crop": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
-#: Further metrics, and the region that each comes with.
+#: Further metrics, and the region that enables each.
 FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
 
 
-#: What each region, and each metric that comes with it, is.
+#: Definitions of each region and of the metrics that it enables.
 _REGIONS = {
     "box": {
         "box": "the smallest upright box of the subject's mask in the target",
@@ -53,12 +52,12 @@ _REGIONS = {
 
 
 class LPIPS:
-    """LPIPS of whole images, by torchmetrics.
+    """LPIPS of whole images, with torchmetrics' network.
 
     Args:
-        signed: map [0, 1] to [-1, 1], for which the network was calibrated;
-            the authors' evaluation does not.
-        key: begins the message of an error.
+        signed: map [0, 1] to [-1, 1], for which the network was calibrated; the authors' evaluation
+            does not.
+        key: prefix of error messages.
 
     Raises:
         InputError: torchvision or the weights are not available."""
@@ -79,51 +78,49 @@ class LPIPS:
     def __call__(
         self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]
     ) -> Float[Tensor, " n"]:
-        """Compare images on the network's device.
+        """LPIPS distance of each image, on the network's device.
 
         Args:
-            image: renders; values outside of the network's range are clamped.
-            target: images in [0, 1].
-
-        Returns:
-            A distance for each image."""
-        # With ``signed`` the network refuses values outside [0, 1], which renders can have.
+            image: renders; values outside the network's range are clamped.
+            target: images in [0, 1]."""
+        # With ``signed`` the network rejects values outside [0, 1], which renders can have.
         low, high = (0, 1) if self.signed else (-1, None)
         images = image.float().clamp(low, high).split(1)
         targets = target.float().clamp(low, high).split(1)
         pairs = zip(images, targets, strict=True)
-        # not as torchmetrics' Metric, which keeps the values of all calls
+        # The network alone: torchmetrics' Metric would store the values of all calls.
         return torch.cat([self.network(*pair, normalize=self.signed) for pair in pairs]).flatten()
 
 
 class MetricsOptions(Options):
-    """What is measured, and how."""
+    """Options of image metrics."""
 
     group = "metrics"
     protocol: Literal["correct", "release", "files"] = "correct"
     """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it
-    was calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. files: as correct,
-    of renders and targets rounded to 8 bits, SSIM without padding. Reported with every number."""
+    was calibrated. release: as the authors' code: no clamp, SSIM padded with zeros, LPIPS on [0, 1].
+    files: as correct, but on renders and targets rounded to 8 bits, SSIM without padding. Reported
+    with every number."""
     regions: tuple[Literal["image", "box", "subject", "crop", "edge"], ...] = (
         "image",
         "box",
         "subject",
         "edge",
     )
-    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask (with PSNR at one
-    brightness), its pixels (without FLIP), the window around the box that GHG and LIFe-GoM crop
-    (1000 x 500 of 1024 x 1024), its outline and edges of true depth (PSNR alone, with light beside
-    the subject and sharpness inside it)."""
+    """Regions in which PSNR, SSIM and FLIP are measured. image: all pixels; box: the mask's bounding
+    box (also PSNR at a common brightness); subject: the mask's pixels (without FLIP); crop: the window
+    around the box used by GHG and LIFe-GoM (1000 x 500 of 1024 x 1024); edge: the mask's outline and
+    edges of true depth (PSNR alone; also light outside the subject and sharpness inside)."""
     lpips: Literal["auto", "require", "off"] = "auto"
-    """auto: left out, with a message, where torchvision or its weights are missing;
-    require: an error."""
+    """auto: skipped with a message if torchvision or its weights are missing; require: an error if they
+    are; off: never computed."""
 
     beside: Literal["correct", "release", "files"] | None = None
-    """Another protocol, measured too: names of its metrics end in its own, such as psnr_correct."""
+    """A second protocol to measure as well; its name is appended to its metrics (psnr_correct)."""
 
     @property
     def is_release(self) -> bool:
-        """Whether the metrics are computed as in the authors' code."""
+        """Whether metrics are computed as in the authors' code."""
         return self.protocol == "release"
 
     @property
@@ -132,27 +129,24 @@ class MetricsOptions(Options):
         return {"release": "zeros", "files": "valid"}.get(self.protocol, "reflect")
 
     def build(self) -> "ImageMetrics":
-        """The metrics; InputError: as of :class:`ImageMetrics`."""
+        """Build the metrics; raises InputError as :class:`ImageMetrics` does."""
         return ImageMetrics(self)
 
 
 class ImageMetrics:
     """All metrics of a protocol.
 
-    Their names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``,
-    ``_subject``, ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`;
-    LPIPS for the whole image only), and those of :data:`FURTHER`.
-
-    Args:
-        options: the protocol.
+    Names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with the suffix ``_box``,
+    ``_subject``, ``_crop`` or ``_edge`` for other regions (see :data:`MEASURED`; LPIPS for the whole
+    image only), and those of :data:`FURTHER`.
 
     Attributes:
-        protocol: its name, which is reported with every number.
-        left_out: the reason for each missing metric.
-        beside: the metrics of another protocol; None: none.
+        protocol: name of the protocol, reported with every number.
+        left_out: reason for each missing metric, by name.
+        beside: metrics of the second protocol, or None.
 
     Raises:
-        InputError: LPIPS is required, and is not available."""
+        InputError: LPIPS is required but not available."""
 
     def __init__(self, options: MetricsOptions):
         self.options = options
@@ -171,7 +165,7 @@ class ImageMetrics:
             self.beside = MetricsOptions(protocol=options.beside, lpips=options.lpips).build()
 
     def to(self, device: torch.device | str) -> "ImageMetrics":
-        """Move the network of LPIPS; returns these metrics."""
+        """Move the network of LPIPS to a device; returns ``self``."""
         if self.lpips is not None:
             self.lpips.network = self.lpips.network.to(device)
         if self.beside is not None:
@@ -180,7 +174,7 @@ class ImageMetrics:
 
     @property
     def names(self) -> list[str]:
-        """The names of the values of a call, in order."""
+        """Names of the values returned by a call, in order."""
         return [*self._of_protocol, *self._beside(dict.fromkeys(self.beside.names if self.beside else ()))]
 
     def _beside(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -199,7 +193,7 @@ class ImageMetrics:
 
     @property
     def definitions(self) -> dict[str, str]:
-        """How each metric and region is defined, to be stored with the numbers."""
+        """Definition of each metric and region, to be stored with the numbers."""
         options = self.options
         renders = {"release": "as they are", "files": "and targets in 8 bits"}
         renders = renders.get(options.protocol, "clamped to [0, 1]")
@@ -231,16 +225,16 @@ class ImageMetrics:
         mask: Bool[Tensor, "n h w"],
         depth: Float[Tensor, "n h w"] | None = None,
     ) -> dict[str, Tensor]:
-        """All metrics of the protocol.
+        """Compute all metrics of the protocol.
 
         Args:
-            image: renders, RGB in [0, 1] or a little outside.
-            target: the photographs, RGB in [0, 1].
-            mask: of the subject in the photographs.
-            depth: true z in the photographs in metres, 0 where unknown; None: unknown.
+            image: renders, RGB in [0, 1] or slightly outside.
+            target: ground truth images, RGB in [0, 1].
+            mask: of the subject in the targets.
+            depth: true z of the targets in metres, 0 where unknown; None: unknown.
 
         Returns:
-            One value per image by each of :attr:`names`; nan where a region is empty."""
+            One value per image for each of :attr:`names`; nan if a region is empty."""
         values = self.measure(image, target, mask, self._of_protocol, depth)
         if self.beside is not None:
             values |= self._beside(self.beside(image, target, mask, depth))
@@ -255,14 +249,14 @@ class ImageMetrics:
         names: Iterable[str],
         depth: Float[Tensor, "n h w"] | None = None,
     ) -> dict[str, Tensor]:
-        """Some metrics of the protocol, without the work for all others.
+        """Compute only some metrics of the protocol.
 
         Args:
-            image, target, mask, depth: as of a call.
-            names: of metrics (:data:`MEASURED` with a region, :data:`FURTHER`, ``lpips``).
+            image, target, mask, depth: as in a call.
+            names: names of metrics (:data:`MEASURED` with a region, :data:`FURTHER`, ``lpips``).
 
         Returns:
-            One value per image by each of the names."""
+            One value per image for each name."""
         if not self.options.is_release:
             image = image.clamp(0, 1)
         if self.options.protocol == "files":
@@ -289,7 +283,7 @@ class ImageMetrics:
         return values
 
     def _map(self, metric: str, image: Tensor, target: Tensor) -> Tensor:
-        """A metric of each pixel, before it is averaged over a region."""
+        """Per-pixel map of a metric, to be averaged over a region."""
         if metric == "psnr":
             return squared_error(image, target)
         if metric == "ssim":

@@ -1,4 +1,4 @@
-"""Regions of an image that metrics are measured in, and means over them."""
+"""Image regions in which metrics are measured, and means over them."""
 
 import torch
 import torch.nn.functional as F
@@ -10,24 +10,16 @@ from ghgs_lit.geometry.masks import between, first_and_last
 
 REGIONS = ("image", "box", "subject", "crop", "edge")
 CROP = (1000 / 1024, 500 / 1024)
-"""Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as
-published scripts of GHG and LIFe-GoM crop."""
+"""Height and width of the region ``crop`` relative to the image: 1000 x 500 of 1024 x 1024, as in
+published scripts of GHG and LIFe-GoM."""
 EDGE = 2
-"""Greatest distance from the subject's outline in the region ``edge``, in rows and columns."""
+"""Largest distance from the subject's outline in the region ``edge``, in rows and columns."""
 DEPTH_STEP = 0.02
-"""Least relative difference of the depths of neighbouring pixels at an edge of depth:
-5 cm at 2.5 m."""
+"""Least relative difference in depth of neighbouring pixels at a depth edge: 5 cm at 2.5 m."""
 
 
 def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | None) -> Float[Tensor, " n"]:
-    """Mean of each map over its region.
-
-    Args:
-        values: maps of a metric.
-        region: the pixels that count; None: all.
-
-    Returns:
-        A mean for each map; nan where the region is empty."""
+    """Mean of each map over its region (None: all pixels); nan if the region is empty."""
     if region is None:
         return values.mean((-2, -1))
     count = region.sum((-2, -1))
@@ -38,14 +30,14 @@ def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | No
 def mean_inside(
     values: Float[Tensor, "n hh ww"], region: Bool[Tensor, "n h w"] | None
 ) -> Float[Tensor, " n"]:
-    """:func:`mean_over` for maps that may lack the image's border.
+    """:func:`mean_over` for maps without the image's border.
 
     Args:
-        values: maps, as large as the image or smaller by the same border on opposite sides.
-        region: the pixels of the image that count, whose border is cut off, too; None: all.
+        values: maps as large as the image, or smaller by the same border on opposite sides.
+        region: pixels of the image, cropped likewise; None: all.
 
     Returns:
-        A mean for each map; nan where what is left of the region is empty."""
+        A mean per map; nan if the cropped region is empty."""
     if region is not None:
         top = (region.shape[1] - values.shape[1]) // 2
         left = (region.shape[2] - values.shape[2]) // 2
@@ -54,21 +46,16 @@ def mean_inside(
 
 
 def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """The bounding box of each mask, as a mask; empty where the mask is empty."""
+    """Bounding box of each mask, as a mask; empty if the mask is empty."""
     return between(mask.any(-1))[:, :, None] & between(mask.any(-2))[:, None, :]
 
 
 def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """A window of :data:`CROP` around the middle of each mask's box.
-
-    Args:
-        mask: of the subject.
-
-    Returns:
-        The window, moved into the image, as a mask; empty where the mask is empty."""
+    """Window of size :data:`CROP` centred on each mask's bounding box and shifted into the image, as a
+    mask; empty if the mask is empty."""
 
     def span(hit: Bool[Tensor, "n k"], share: float) -> Bool[Tensor, "n k"]:
-        """Rows or columns of the window, from those that the mask hits."""
+        """Rows or columns of the window, given those that the mask touches."""
         count = hit.shape[1]
         side = round(share * count)
         index = torch.arange(count, device=hit.device)
@@ -81,26 +68,15 @@ def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
 
 
 def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
-    """Dilate masks.
-
-    Args:
-        mask: True where something is.
-        pixels: largest distance in rows and in columns.
-
-    Returns:
-        Each mask with all pixels at most so far away."""
+    """Dilate masks by a square of ``2 * pixels + 1``."""
     return F.max_pool2d(mask[:, None].float(), 2 * pixels + 1, 1, pixels)[:, 0].bool()
 
 
 def depth_edges(depth: Float[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """Pixels on both sides of an edge of depth:
-    next to a neighbour :data:`DEPTH_STEP` nearer or farther.
+    """Pixels on both sides of a depth edge, at which neighbours differ by more than :data:`DEPTH_STEP`.
 
     Args:
-        depth: z in metres; 0 is unknown, and no edge.
-
-    Returns:
-        A mask of each map."""
+        depth: z in metres; 0: unknown, never an edge."""
     edges = torch.zeros_like(depth, dtype=torch.bool)
     for axis in (1, 2):
         count = depth.shape[axis] - 1
@@ -116,18 +92,15 @@ def depth_edges(depth: Float[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
 def region_of(
     mask: Bool[Tensor, "n h w"], name: str, depth: Float[Tensor, "n h w"] | None = None
 ) -> Bool[Tensor, "n h w"] | None:
-    """The pixels of a region.
+    """Pixels of a region, as a mask; None for the whole image.
 
     Args:
         mask: of the subject.
         name: one of :data:`REGIONS`.
-        depth: true z in metres, 0 where unknown; its edges belong to ``edge``. None: unknown.
-
-    Returns:
-        A mask; None for the whole image.
+        depth: true z in metres, 0 where unknown, whose edges belong to ``edge``; None: unknown.
 
     Raises:
-        InputError: there is no such region."""
+        InputError: the region is unknown."""
     choice("region", name, REGIONS)
     if name == "image":
         return None

@@ -1,4 +1,4 @@
-"""Attention of the recalibration, drawn on the photographs."""
+"""Pictures of the recalibration's attention, overlaid on the input images."""
 
 import numpy as np
 import torch
@@ -17,17 +17,14 @@ _QUERY = (255, 60, 220)
 def chosen_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
-    """The token with a valid point that is nearest to a place.
+    """Index of the packed token with a valid point nearest to ``at``; None if its view has none.
 
     Args:
-        tokens: Packed tokens of a batch.
-        points: Their points, of which some are invalid.
-        element: Number of the subject in the batch.
-        at: ``(view, row, column)`` on the grid of tokens;
-            None: the middle of the subject in its first view.
-
-    Returns:
-        Index of the packed token; None where its view has no valid one.
+        tokens: packed tokens of a batch.
+        points: their points, some of them invalid.
+        element: index of the subject in the batch.
+        at: ``(view, row, column)`` on the grid of tokens; None: the centre of the subject in its
+            first view.
 
     Raises:
         InputError: ``at`` is outside the grid.
@@ -49,14 +46,14 @@ def chosen_token(
 def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:
     """Picture of a subject's views with the query token (outlined) and its neighbours.
 
-    The first row shows the neighbours, the nearest brightest; captions count them in each view.
-    Then one row for each layer shows the weights, averaged over heads, the largest brightest, and
-    beside them those with ``s = 1`` where they differ; captions give shares of views.
+    The first row shows the neighbours, the nearest brightest; captions give their number per view.
+    One row per layer shows the weights averaged over heads, the largest brightest, followed by those
+    with ``s = 1`` if they differ; captions give the share of each view.
 
     Args:
-        batch: With photographs of whole patches.
-        tokens: Packed tokens of the batch.
-        attention: Of one of these tokens.
+        batch: with images of whole patches.
+        tokens: packed tokens of the batch.
+        attention: attention of one of these tokens.
 
     Returns:
         Picture [h, w, 3] RGB uint8.
@@ -88,17 +85,7 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 def _tiles(
     images: list[np.ndarray], tokens: Tokens, attention: TokenAttention, strengths: Tensor
 ) -> list[np.ndarray]:
-    """The views of a subject with coloured neighbours.
-
-    Args:
-        images: Photographs of the views [h, w, 3] uint8.
-        tokens: Packed tokens of the batch.
-        attention: Names the query and its k neighbours.
-        strengths: Brightness of each neighbour [k], in [0, 1].
-
-    Returns:
-        One picture for each view.
-    """
+    """Overlay the neighbours on each view, with ``strengths`` in [0, 1] as brightness."""
     scale = max(1, -(-_SIDE // images[0].shape[0]))
     side = tokens.patch_size * scale
     views = tokens.grid[1]

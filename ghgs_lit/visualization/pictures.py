@@ -1,5 +1,5 @@
-"""Photographs, renders, errors and depths side by side, as pictures [h, w, 3] RGB uint8, and coloured
-point clouds for a viewer in 3D."""
+"""Pictures [h, w, 3] RGB uint8 of input images, renders, errors and depths, and coloured point clouds for
+a 3D viewer."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -14,10 +14,10 @@ from torch import Tensor
 from ghgs_lit.files import write_atomically
 from ghgs_lit.types import Batch, Prediction
 
-_LETTERS = 22  # Height of letters: the narrowest tile's width over this, ...
-_LEAST_LETTERS = 10  # ... at least, in pixels
+_LETTERS = 22  # Width of the narrowest tile divided by the height of letters
+_LEAST_LETTERS = 10  # Least height of letters in pixels
 _GAP = 2
-ERROR_GAIN = 4.0  #: Factor of errors before they are shown
+ERROR_GAIN = 4.0  #: Factor of errors in pictures
 BODY_COLOR = (0.25, 0.5, 0.95)
 
 Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]  #: Positions and colours
@@ -25,45 +25,30 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]  #: Positions and colo
 
 @cache
 def palette(name: str) -> np.ndarray:
-    """Colours of a colour map of matplotlib.
-
-    Args:
-        name: Such as ``viridis``.
-
-    Returns:
-        256 RGB colours [256, 3] uint8.
-    """
+    """RGB colours [256, 3] uint8 of a matplotlib colour map, such as ``viridis``."""
     import matplotlib
 
     return (matplotlib.colormaps[name](np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """A picture of an image.
+    """Convert an RGB image [3, h, w] to a picture [h, w, 3] uint8.
 
-    Args:
-        image: RGB [3, h, w]; values outside [0, 1] are clamped,
-            those that are not finite are black or white.
-
-    Returns:
-        Picture [h, w, 3] uint8.
+    Values outside [0, 1] are clamped; NaN becomes black, infinity black or white by its sign.
     """
     image = image.detach().float().cpu().nan_to_num(0).clamp(0, 1)
     return (image * 255).round().byte().permute(1, 2, 0).numpy()
 
 
 def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor | None = None) -> np.ndarray:
-    """Values in colours of a palette.
+    """Map values [h, w] to colours of a palette, as a picture [h, w, 3] uint8.
 
     Args:
-        values: Any numbers [h, w].
-        low: Value of the first colour.
-        high: Value of the last colour.
-        name: Of the palette.
-        valid: Where values are shown [h, w]; black elsewhere. None: everywhere.
-
-    Returns:
-        Picture [h, w, 3] uint8.
+        values: any numbers [h, w].
+        low: value of the first colour.
+        high: value of the last colour.
+        name: name of the palette.
+        valid: pixels to show [h, w], black elsewhere; None: all.
     """
     values = values.detach().float().cpu()
     scaled = ((values - low) / max(high - low, 1e-9)).nan_to_num(0).clamp(0, 1)
@@ -74,20 +59,17 @@ def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor |
 
 
 def error_map(image: Tensor, target: Tensor) -> np.ndarray:
-    """A picture of the mean absolute error over the channels, times ``ERROR_GAIN``.
+    """Picture [h, w, 3] uint8 of the mean absolute error over the channels, times :data:`ERROR_GAIN`.
 
     Args:
         image: RGB [3, h, w] in [0, 1].
-        target: The same for the truth.
-
-    Returns:
-        Picture [h, w, 3] uint8.
+        target: ground truth, likewise.
     """
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
 def _caption_lines(caption: str, width: int, font: ImageFont.FreeTypeFont) -> list[str]:
-    """Break a caption at its spaces into lines no wider than its tile; longer words stay as they are."""
+    """Wrap a caption at spaces to the width of its tile; longer words are not broken."""
     lines = []
     for word in caption.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -99,11 +81,11 @@ def _caption_lines(caption: str, width: int, font: ImageFont.FreeTypeFont) -> li
 
 
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
-    """Tiles side by side, each below its caption.
+    """Concatenate tiles horizontally, each below its caption.
 
     Args:
-        tiles: Pictures [h, w, 3] uint8 of any sizes.
-        captions: One for each tile; long ones take several lines, and what is wider than its tile is cut.
+        tiles: pictures [h, w, 3] uint8 of any sizes.
+        captions: one per tile, wrapped to its width; words wider than the tile are clipped.
 
     Returns:
         Picture [h, w, 3] uint8.
@@ -132,14 +114,7 @@ def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
 
 
 def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows below one another, padded on the right.
-
-    Args:
-        rows: Pictures [h, w, 3] uint8.
-
-    Returns:
-        Picture [h, w, 3] uint8.
-    """
+    """Concatenate pictures [h, w, 3] uint8 vertically, padded on the right."""
     width = max(r.shape[1] for r in rows)
     return np.concatenate([np.pad(r, ((0, _GAP), (0, width - r.shape[1]), (0, 0))) for r in rows])
 
@@ -147,19 +122,8 @@ def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
 def _depth_rows(
     batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
 ) -> list[np.ndarray]:
-    """A row of predicted and a row of true depths of one subject, in the same colours.
-
-    Captions say which depth is red (near) and which is blue.
-
-    Args:
-        batch: With masks, and depths where they are known.
-        element: Number of the subject in the batch.
-        depth: Predicted depths [B, V, H, W], metres; None: no row of them.
-        depth_valid: Where they are defined [B, V, H, W]; None: in the masks.
-
-    Returns:
-        Up to two pictures [h, w, 3] uint8.
-    """
+    """A row of predicted and a row of true depths (those given) of one subject, in the same colours;
+    captions give the depths shown in red (near) and blue (far)."""
     masks = batch.masks[element]
     maps = {}
     if depth is not None:
@@ -168,7 +132,7 @@ def _depth_rows(
         maps["true depth"] = (batch.depths[element], masks & (batch.depths[element] > 0))
     if not maps:
         return []
-    ends = []  # 1st and 99th percentile of each view's (true, if known) depths
+    ends = []  # 1st and 99th percentiles of each view's depths (true ones if known)
     for depths, valid in zip(*list(maps.values())[-1], strict=True):
         known = depths[valid].detach().float().cpu().numpy()
         ends.append(np.quantile(known, [0.01, 0.99]).tolist() if known.size else (0.0, 1.0))
@@ -187,16 +151,16 @@ def sheet(
     depth: Tensor | None = None,
     depth_valid: Tensor | None = None,
 ) -> np.ndarray:
-    """A picture of one subject: inputs, their depths, then target, render and error of each target.
+    """Picture of one subject: inputs, their depths, then target, render and error of each target view.
 
     Args:
-        batch: photographs, masks, and depths and targets where they are known.
-        image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, which
-            then stand below them with their errors; None: no renders.
-        element: number of the subject in the batch.
-        depth: predicted depths [B, V, H, W] in the unit of the cameras, as in captions (of data sets:
-            metres); None: no row of them.
-        depth_valid: where they are defined [B, V, H, W]; None: in the masks.
+        batch: images and masks, and depths and targets where known.
+        image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, shown
+            below these with their errors; None: no renders.
+        element: index of the subject in the batch.
+        depth: predicted depths [B, V, H, W] in the unit of the cameras, which captions use, too (of
+            data sets: metres); None: no such row.
+        depth_valid: pixels with a defined depth [B, V, H, W]; None: the masks.
 
     Returns:
         Picture [h, w, 3] uint8.
@@ -216,7 +180,7 @@ def sheet(
         name = batch.targets.names[element][t] if batch.targets.names else str(t)
         tiles += [to_uint8(target), to_uint8(render), error_map(render, target)]
         captions += [f"target {name}", "render", f"error x{ERROR_GAIN:g}"]
-    # three tiles for each target; many targets in an about square picture
+    # Three tiles per target; many targets fill a roughly square picture.
     in_row = 3 * max(1, round((len(tiles) / 9) ** 0.5))
     for first in range(0, len(tiles), in_row):
         part = slice(first, first + in_row)
@@ -225,30 +189,21 @@ def sheet(
 
 
 def save_png(picture: np.ndarray, path: Path) -> None:
-    """Write a picture as a PNG, whole or not at all.
-
-    Args:
-        picture: RGB [h, w, 3] uint8.
-        path: Of the file.
-    """
+    """Write a picture [h, w, 3] RGB uint8 as a PNG, atomically."""
     write_atomically(path, lambda temporary: Image.fromarray(picture).save(temporary, format="PNG"))
 
 
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
-    """Point clouds of one subject.
+    """Point clouds of one subject by name: positions [n, 3] in metres and colours [n, 3] in [0, 1].
 
-    ``points``: unprojected pixels in their colours; ``body``: body vertices, where the data
-    has them; ``points_and_body``: both, whose distance the Chamfer term measures. Empty
-    clouds are left out.
+    ``points``: unprojected pixels in their colours; ``body``: body vertices, if the data has them;
+    ``points_and_body``: both, whose distance the Chamfer term measures. Empty clouds are left out.
 
     Args:
-        batch: Photographs, masks and bodies are read.
-        prediction: Of that batch.
-        element: Number of the subject in the batch.
-        limit: Largest number of points and of vertices.
-
-    Returns:
-        Positions [n, 3] in metres and colours [n, 3] in [0, 1] by name.
+        batch: with images, masks and, optionally, bodies.
+        prediction: prediction of that batch.
+        element: index of the subject in the batch.
+        limit: largest number of points and of vertices.
     """
     valid = prediction.points.valid[element] & batch.masks[element]
     colors = batch.images[element].movedim(1, -1)

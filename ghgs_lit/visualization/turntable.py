@@ -1,4 +1,4 @@
-"""Cameras on a circle around the subject, and where the subject of given cameras is."""
+"""Cameras on a circle around the subject, and the position of the subject of given cameras."""
 
 import math
 
@@ -8,20 +8,14 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import look_at_point, project
 from ghgs_lit.types import Cameras, Gaussians
 
-_OPAQUE = 0.5  #: Least opacity of Gaussians that make up the subject
-_OUTSIDE = 1e-3  #: Share of them cut off at each face of the subject's box: floaters
-_SHARE = 0.95  #: Largest share of a picture's height and width that the subject takes
+_OPAQUE = 0.5  #: Least opacity of Gaussians that represent the subject
+_OUTSIDE = 1e-3  #: Fraction of them (floaters) clipped at each face of the subject's box
+_SHARE = 0.95  #: Largest fraction of a picture's height and width that the subject fills
 
 
 def subject_points(gaussians: Gaussians) -> Tensor:
-    """Centres of one subject's opaque Gaussians (all, if none is), without outliers.
-
-    Args:
-        gaussians: Of one subject.
-
-    Returns:
-        Points [n, 3], float64, in the world's unit.
-    """
+    """Centres [n, 3] of one subject's opaque Gaussians (all, if none is opaque) without outliers, in
+    float64 and the world's unit."""
     opaque = gaussians.opacities >= _OPAQUE
     points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
     if not len(points):
@@ -34,49 +28,28 @@ def subject_points(gaussians: Gaussians) -> Tensor:
 
 
 def center_of(points: Tensor, cameras: Cameras) -> Tensor:
-    """The middle of the box around points; without any, where the optical axes meet.
-
-    Args:
-        points: Of the subject [n, 3], float64.
-        cameras: V cameras.
-
-    Returns:
-        Point [3], float64.
-    """
+    """Centre [3] of the bounding box of points [n, 3], in float64; without points, where the optical
+    axes of the V cameras meet."""
     return (points.amin(0) + points.amax(0)) / 2 if len(points) else look_at_point(cameras)
 
 
 def pixel_size(cameras: Cameras, center: Tensor) -> float:
-    """The side of a photograph's pixel at the subject, mean over cameras.
-
-    Args:
-        cameras: V cameras.
-        center: Point [3] of the subject.
-
-    Returns:
-        Length in the world's unit.
-    """
+    """Size of a pixel at the subject's ``center`` [3] in the world's unit, mean over V cameras."""
     depths = ((center - cameras.centers) * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())
 
 
 def up_direction(cameras: Cameras) -> Tensor:
-    """The direction that is up in photographs.
+    """Estimate the up direction from V upright cameras: a unit vector [3] in the world, float64.
 
     Upright cameras may look up or down, but the rows of their images are level: up is perpendicular
-    to all rows, and nearest to the mean upward column. A world axis within 3 degrees of it is
-    returned instead, so that small tilts of the cameras do not tilt an upright world.
-
-    Args:
-        cameras: V cameras.
-
-    Returns:
-        Unit vector [3] of the world, float64.
+    to all rows and, among such directions, nearest to the mean upward column. A world axis within 3
+    degrees of it is returned instead, so that small tilts of the cameras do not tilt an upright world.
     """
     rows = cameras.extrinsics[:, 0, :3].double()
     columns = cameras.extrinsics[:, 1, :3].double()
     mean = -columns.mean(0)
-    # Least squares; the small weight of the mean decides where all rows of images are parallel.
+    # Least squares; the small weight of the mean decides if all image rows are parallel.
     weight = 1e-3 * len(rows)
     level = rows.mT @ rows + weight * torch.eye(3, dtype=rows.dtype, device=rows.device)
     up = torch.nn.functional.normalize(torch.linalg.solve(level, weight * mean), dim=0)
@@ -87,34 +60,29 @@ def up_direction(cameras: Cameras) -> Tensor:
 
 
 def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Cameras:
-    """Cameras on one turn around the subject, at the mean distance and height of the given ones.
+    """Cameras on a full circle around the subject, at the mean distance and height of the given ones.
 
-    They start at the side of the first camera and have its lens. With points of the subject they
-    turn about the middle of the points' box, look straight at it, and have a wider lens where that
-    of the first camera would cut points off. Without, they turn about where the optical axes meet.
+    The circle starts at the first camera's side, with its intrinsics. With points of the subject,
+    cameras circle the centre of the points' box, look straight at it, and have a wider field of view
+    if the first camera's would cut points off. Without, they circle the point where the optical axes
+    meet.
 
     Args:
         cameras: V cameras.
-        frames: Number of cameras on the turn.
-        points: Of the subject [n, 3], n may be 0; None: not known.
-
-    Returns:
-        ``frames`` cameras.
+        frames: number of cameras on the circle.
+        points: points of the subject [n, 3], n may be 0; None: unknown.
     """
     angles = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / max(frames, 1))
     return orbit(cameras, angles, points)
 
 
 def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cameras:
-    """Cameras as of :func:`turntable`, at any angles.
+    """Cameras as in :func:`turntable`, at given angles.
 
     Args:
         cameras: V cameras.
-        angles: From the first camera's side [n], float64, radians.
-        points: Of the subject [m, 3], m may be 0; None: not known.
-
-    Returns:
-        n cameras.
+        angles: angles from the first camera's side [n], float64, in radians.
+        points: points of the subject [m, 3], m may be 0; None: unknown.
     """
     center = look_at_point(cameras) if points is None else center_of(points, cameras)
     frames = len(angles)
@@ -141,18 +109,7 @@ def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cam
 
 
 def _fitted(intrinsics: Tensor, extrinsics: Tensor, points: Tensor, height: int, width: int) -> Tensor:
-    """Intrinsics with the principal point in the middle and a lens that shows all points.
-
-    Args:
-        intrinsics: Of n cameras [n, 3, 3], pixels.
-        extrinsics: World to camera [n, 4, 4].
-        points: That must be seen [m, 3].
-        height: Of the pictures, pixels.
-        width: Of the pictures, pixels.
-
-    Returns:
-        Intrinsics [n, 3, 3].
-    """
+    """Centre the principal point, and shorten focal lengths until all points are in the frame."""
     middle = intrinsics.new_tensor([width / 2, height / 2])
     intrinsics = intrinsics.clone()
     intrinsics[:, :2, 2] = middle
