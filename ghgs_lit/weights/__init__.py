@@ -1,1 +1,1 @@
-"""Weight files: checkpoints of this package, and the published weights in both directions."""
+"""Weight files: checkpoints of this package, and import and export of published weights."""

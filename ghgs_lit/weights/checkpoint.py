@@ -1,5 +1,4 @@
-"""Checkpoints of this package: plain data with the whole configuration,
-enough to rebuild the model."""
+"""Checkpoints of this package: plain data with the whole configuration, enough to rebuild the model."""
 
 import warnings
 from collections.abc import Mapping
@@ -23,16 +22,16 @@ STATE_PREFIX = "model."  #: Prefix of the model's tensors in the state of a Ligh
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
-    """Read a checkpoint of this package, including frozen weights that it shares (:mod:`.frozen`).
+    """Read a checkpoint of this package, including its shared frozen weights (:mod:`.frozen`).
 
-    Tensors are mapped from the disk, not read.
+    Tensors are memory-mapped, not read.
 
     Args:
-        path: of the file, or :data:`ghgs_lit.weights.reading.SHIPPED`.
-        whole: read every byte once and refuse a damaged file (2 s for 1 GB).
+        path: path of the file, or :data:`ghgs_lit.weights.reading.SHIPPED`.
+        whole: read every byte once and reject a damaged file (2 s for 1 GB).
 
     Returns:
-        Its content: ``state_dict``, ``config``, ``format_version`` and further facts.
+        Its content: ``state_dict``, ``config``, ``format_version`` and further entries.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -56,44 +55,25 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """The configuration in a checkpoint.
-
-    Args:
-        path: as for :func:`read_checkpoint`.
-
-    Returns:
-        Nested mappings of plain values.
-
-    Raises:
-        FileNotFoundError: as :func:`read_checkpoint`.
-        InputError: as :func:`read_checkpoint`.
-    """
+    """Read the configuration of a checkpoint, nested mappings of plain values; arguments and errors as
+    for :func:`read_checkpoint`."""
     return read_checkpoint(path)["config"]
 
 
 def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse nodes and tensors of impossible types;
-    values of nodes are checked where they are used."""
+    """Reject nodes and tensors of impossible types; values of nodes are checked where they are used."""
     require_plain(checkpoint["config"], f"{path}: config")
     for name, node in checkpoint["config"].items():
         fits = name not in KINDS or node is None or isinstance(node, Mapping)
         require(fits, f"{path}: config.{name}", "a mapping of its keys", node)
-    # Verbs merge parts of the configuration into their own,
-    # where OmegaConf would evaluate resolvers.
+    # Commands merge parts of it into their configuration, where OmegaConf would evaluate resolvers.
     for key, value in flatten(checkpoint["config"]).items():
         require("${" not in repr(value), f"{path}: config.{key}", "a value, no interpolation", value)
     require_dense(checkpoint["state_dict"], path)
 
 
 def describe(content: Any) -> str:
-    """Content of an unexpected file in a few words, for messages.
-
-    Args:
-        content: anything that a file may hold.
-
-    Returns:
-        The first keys of a mapping, or the type of anything else.
-    """
+    """Describe the content of an unexpected file in messages: the first keys of a mapping, else its type."""
     if not isinstance(content, Mapping):
         return f"a {type(content).__name__}"
     names = [repr(name) for name in content]
@@ -102,14 +82,11 @@ def describe(content: Any) -> str:
 
 
 def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> dict[str, Tensor]:
-    """Tensors of the model; a LightningModule's checkpoint also holds those of losses.
+    """Tensors of the model by name; a LightningModule's checkpoint also holds those of losses.
 
     Args:
-        checkpoint: of :func:`read_checkpoint`.
-        prefix: what the names of the wanted tensors start with.
-
-    Returns:
-        Tensors by name, without the prefix.
+        checkpoint: from :func:`read_checkpoint`.
+        prefix: prefix of the wanted names, which is removed.
     """
     return {
         key.removeprefix(prefix): value
@@ -124,11 +101,11 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
     Args:
         module: its tensors may be on the meta device.
         state: tensors by name.
-        source: of the state, for messages.
+        source: origin of the state, for messages.
 
     Raises:
-        InputError: a key is missing, unknown or has another shape;
-            names source, key and both shapes.
+        InputError: a key is missing or unknown, or a shape differs; the message names source, key
+            and both shapes.
     """
     tensors = module.state_dict()
     for key in tensors:
@@ -139,32 +116,32 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
 
 
 def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
-    """Refuse weights with NaN or infinity, which make every prediction empty.
+    """Reject weights with NaN or infinity, which make every prediction empty.
 
     Args:
         state: tensors by name.
-        source: of the state, for messages.
+        source: origin of the state, for messages.
 
     Raises:
-        InputError: a number is not finite; names source and key.
+        InputError: a value is not finite; the message names source and key.
     """
     for key, value in state.items():
-        # The sum is not finite if any term is not, and needs no second tensor.
-        # Half precision would overflow.
+        # The sum is finite only if all terms are, and needs no second tensor. Half precision would
+        # overflow.
         total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))
         require(bool(total.isfinite()), f"{source}: {key}", "finite numbers", "NaN or infinity")
 
 
 def load_strictly(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Copy all of a state into a module.
+    """Copy a state into a module, after :func:`require_fit` and :func:`require_finite`.
 
     Args:
-        module: whose tensors are overwritten.
+        module: the module to overwrite.
         state: tensors by name.
-        source: of the state, for messages.
+        source: origin of the state, for messages.
 
     Raises:
-        InputError: as :func:`require_fit` and :func:`require_finite`.
+        InputError: as in these two functions.
     """
     require_fit(module, state, source)
     require_finite(state, source)
@@ -172,15 +149,15 @@ def load_strictly(module: nn.Module, state: Mapping[str, Any], source: str | Pat
 
 
 def require_shape(key: str, own: Tensor, found: Any) -> None:
-    """Refuse a value that differs in shape from the model's tensor or holds no floats.
+    """Reject a value that is not a floating point tensor with the shape of the model's.
 
     Args:
-        key: place of the value, for messages.
+        key: location of the value, for messages.
         own: the model's tensor.
         found: the value, a tensor or anything else.
 
     Raises:
-        InputError: names the key and both shapes, or the dtype.
+        InputError: the message names the key and both shapes, or the dtype.
     """
     expected = f"shape {tuple(own.shape)} of the configured model"
     require(shape_of(found) == tuple(own.shape), key, expected, shape_of(found))
@@ -188,17 +165,17 @@ def require_shape(key: str, own: Tensor, found: Any) -> None:
 
 
 def shape_of(value: Any) -> tuple[int, ...] | str:
-    """The shape of a tensor, or the type of anything else, for messages."""
+    """Shape of a tensor, or type name of anything else, for messages."""
     return tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
 
 
 def write_checkpoint(
     path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any
 ) -> None:
-    """Write a checkpoint, whole or not at all.
+    """Write a checkpoint atomically.
 
     Args:
-        path: of the file.
+        path: path of the file.
         state: tensors of the model by name.
         config: the whole configuration, as plain data.
         facts: further entries of the file, plain data.
@@ -216,13 +193,13 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
     """Write the model of a checkpoint without optimizer, losses and progress.
 
     Args:
-        checkpoint: of a whole model.
-        path: of the file to write.
-        dtype: of all weights: ``float16``, ``bfloat16`` or ``float32``.
+        checkpoint: checkpoint of a whole model.
+        path: file to write.
+        dtype: dtype of all weights: ``float16``, ``bfloat16`` or ``float32``.
 
     Raises:
-        InputError: a weight overflows the dtype, both are one file, or the checkpoint holds the
-            encoder alone.
+        InputError: a weight overflows the dtype, both paths are the same file, or the checkpoint
+            holds the encoder alone.
     """
     if resolved(checkpoint) == resolved(path):
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
@@ -230,7 +207,7 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
     require("depth_head" in content["config"], str(checkpoint), "a whole model", "the encoder alone")
     state = {name: tensor.to(getattr(torch, dtype)) for name, tensor in model_state(content).items()}
     require_finite(state, f"{checkpoint} as {dtype}")
-    # Paths of the machine that trained it are dropped; loading reads ``imported``.
+    # Paths of the training machine are dropped; loading reads ``imported``.
     config = {**content["config"], "resume": None, "init_from": None}
     facts = {"imported": content["imported"]} if "imported" in content else {}
     write_checkpoint(path, state, config, **facts)
@@ -239,15 +216,15 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
 def load_weights(
     model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
 ) -> None:
-    """Give a :class:`ghgs_lit.method.model.GHGS` the weights of a checkpoint, mapped from the file,
-    not copied.
+    """Load the weights of a checkpoint into a :class:`ghgs_lit.method.model.GHGS`, memory-mapped instead
+    of copied.
 
     Args:
-        model: its own weights may be on the meta device.
+        model: its present weights may be on the meta device.
         path: as for :func:`read_checkpoint`.
-        dtype: precision of the encoder (None: as in the file, but float32 on a CPU without that
-            half precision, and for float64); the heads are float32.
-        device: where the weights will be moved to.
+        dtype: dtype of the encoder (None: as in the file, but float32 on a CPU without that half
+            precision, and for float64); the heads are float32.
+        device: device that the weights will be moved to.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -269,14 +246,12 @@ def load_weights(
 
 
 def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Compare the model's token preset with those that the checkpoint was trained with.
-
-    Fewer than all tokens with the authors' weights give a warning.
+    """Warn if the authors' weights are used with fewer than all tokens.
 
     Args:
         model: a :class:`ghgs_lit.method.model.GHGS`.
-        checkpoint: its content.
-        path: of the checkpoint, for messages.
+        checkpoint: content of the checkpoint.
+        path: path of the checkpoint, for messages.
     """
     is_release = "release" in (checkpoint.get("imported") or {})
     if is_release and model.skip.tokens != "all":

@@ -1,4 +1,4 @@
-"""Frozen weights, which all checkpoints of a run share in one file beside them."""
+"""Frozen weights, stored once in a file that all checkpoints of a run share."""
 
 import contextlib
 import hashlib
@@ -15,7 +15,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights.reading import file_of, open_file, require_dense
 
-#: Bytes of frozen weights up to which each checkpoint holds its own.
+#: Largest size in bytes of frozen weights that each checkpoint stores itself.
 OWN = 1 << 26
 #: Version of checkpoints that share a file; readers of version 2 would miss its tensors.
 SHARING = 3
@@ -23,14 +23,7 @@ PATTERN = "frozen-*.pt"  #: Names of the files
 
 
 def digest_of(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names, dtypes, shapes and bytes.
-
-    Args:
-        tensors: by name, in any order.
-
-    Returns:
-        64 hexadecimal digits.
-    """
+    """SHA-256, in hexadecimal digits, of names, dtypes, shapes and bytes; independent of the order."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
@@ -40,18 +33,18 @@ def digest_of(tensors: Mapping[str, Tensor]) -> str:
 
 
 class Frozen:
-    """Moves the tensors that a checkpoint names under ``frozen`` into a shared file."""
+    """Moves the tensors listed under a checkpoint's ``frozen`` into a shared file."""
 
     def __init__(self) -> None:
         self._known: list[tuple[str, int, int]] = []
         self._digest = ""
 
     def stored(self, checkpoint: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """A checkpoint with a reference to the shared file in place of its frozen tensors.
+        """Replace the frozen tensors of a checkpoint by a reference to the shared file.
 
         Args:
-            checkpoint: whose ``frozen`` names some of its tensors.
-            folder: that the checkpoint will be in; the shared file is written there if it is new.
+            checkpoint: its ``frozen`` lists names of some of its tensors.
+            folder: folder of the checkpoint; the shared file is written there if it is new.
 
         Returns:
             The content to write; ``checkpoint`` unchanged if frozen tensors are small
@@ -62,7 +55,7 @@ class Frozen:
         if sum(tensor.nbytes for tensor in tensors.values()) <= OWN:
             return checkpoint
         known = [(name, tensor.data_ptr(), tensor._version) for name, tensor in tensors.items()]
-        if known != self._known:  # hashed again only if something wrote to them
+        if known != self._known:  # hash again only if the tensors have changed
             self._known = known
             self._digest = digest_of(tensors)
         path = folder / PATTERN.replace("*", self._digest[:16])
@@ -77,7 +70,7 @@ class Frozen:
 
 
 def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write the file, or link the same file of a neighbouring run of a sweep."""
+    """Write the file, or hard-link the same file of another run of the sweep."""
     for twin in path.parent.parent.parent.glob(f"*/{path.parent.name}/{path.name}"):
         with contextlib.suppress(OSError):  # some file systems have no links
             return write_atomically(path, partial(os.link, twin))
@@ -85,18 +78,15 @@ def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
-    """A checkpoint with the tensors of its shared file, if any.
+    """Add the tensors of its shared file, if any, to the content of a checkpoint.
 
     Args:
-        path: that the checkpoint was read from.
+        path: path that the checkpoint was read from.
         checkpoint: its content.
         whole: check the SHA-256 of the shared tensors.
 
-    Returns:
-        The content with all tensors.
-
     Raises:
-        InputError: there is no such file beside the checkpoint, or it holds something else.
+        InputError: the shared file is missing from the checkpoint's folder, or has other content.
     """
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)

@@ -1,5 +1,5 @@
-"""Published weights in both directions: import to a checkpoint, in which every tensor is used or listed
-as ignored, and export of a checkpoint's tensors under their published names."""
+"""Import of published weights to a checkpoint (every tensor must be used or listed as ignored), and export
+of a checkpoint's tensors under their published names."""
 
 import hashlib
 import re
@@ -27,7 +27,7 @@ from ghgs_lit.weights.switches import differences
 
 FILE = "model.safetensors"
 
-#: facebook/VGGT-1B. A file of the aggregator alone has no prefix ``aggregator.``.
+#: Our prefixes by those of facebook/VGGT-1B. A file of the aggregator alone lacks ``aggregator.``.
 VGGT = {
     "aggregator.": "encoder.aggregator.",
     "camera_token": "encoder.aggregator.camera_token",
@@ -37,10 +37,10 @@ VGGT = {
     "global_blocks.": "encoder.aggregator.global_blocks.",
 }
 
-#: Parts of VGGT-1B that the method does not have: 62, 62, 69 and 394 tensors.
+#: Parts of VGGT-1B that the method does not use: 62, 62, 69 and 394 tensors.
 VGGT_IGNORED = ("depth_head.", "point_head.", "camera_head.", "track_head.")
 
-#: The checkpoint of the authors' release, under the key ``network``.
+#: Our prefixes by those of the authors' checkpoint, whose tensors are under the key ``network``.
 RELEASE = {
     "pos_head.": "depth_head.dpt.",
     "blk.": "recalibration.block.",
@@ -52,19 +52,12 @@ RELEASE = {
 }
 RELEASE_ENTRY = "network"
 
-UNPUBLISHED = ".guide."  #: Part of the names of tensors that only our variants of the model have
+UNPUBLISHED = ".guide."  #: Part of the names of tensors that only this package's variants have
 
 
 def to_ours(name: str, table: Mapping[str, str]) -> str | None:
-    """Our name of a published tensor.
-
-    Args:
-        name: the published one.
-        table: our prefixes by published ones.
-
-    Returns:
-        The name; None if ``table`` has none.
-    """
+    """Convert a published name of a tensor to ours; None if ``table`` (our prefixes by published ones)
+    has no match."""
     for published, ours in table.items():
         if name.startswith(published):
             return ours + name.removeprefix(published)
@@ -72,15 +65,8 @@ def to_ours(name: str, table: Mapping[str, str]) -> str | None:
 
 
 def to_published(name: str, table: Mapping[str, str]) -> str | None:
-    """The published name of one of our tensors.
-
-    Args:
-        name: ours.
-        table: our prefixes by published ones.
-
-    Returns:
-        The name; None if it has none.
-    """
+    """Convert our name of a tensor to the published one; None if there is none. Inverse of
+    :func:`to_ours`."""
     if UNPUBLISHED in name:
         return None
     for published, ours in table.items():
@@ -90,14 +76,8 @@ def to_published(name: str, table: Mapping[str, str]) -> str | None:
 
 
 def is_repository(name: str) -> bool:
-    """Whether a name looks like ``owner/repository`` rather than like a file.
-
-    Args:
-        name: of a source of weights.
-
-    Returns:
-        False where there is a file of that name, or where it ends as a file of weights does.
-    """
+    """Whether a source of weights looks like ``owner/repository``: neither an existing file nor with the
+    suffix of a weight file."""
     return (
         re.fullmatch(r"[\w.-]+/[\w.-]+", name) is not None
         and Path(name).suffix not in (".pt", ".pth", ".bin", ".ckpt", ".safetensors")
@@ -106,17 +86,17 @@ def is_repository(name: str) -> bool:
 
 
 def fetch(repository: str) -> tuple[str, Path, str]:
-    """Weights of a repository, from the local cache or the hub.
+    """Get the weights of a repository from the local cache or the Hugging Face hub.
 
     Args:
         repository: ``owner/repository``.
 
     Returns:
-        Its name, the path of the file and its SHA-256.
+        Name of the repository, path of the file and its SHA-256.
 
     Raises:
-        InputError: the package, the network or the repository is missing, or the checksum is not
-            the published one.
+        InputError: the package huggingface_hub, the network or the repository is not available, or
+            the checksum differs from the published one.
     """
     hub = installed("huggingface_hub", "hub", repository)
     cached = hub.try_to_load_from_cache(repository, FILE)
@@ -130,7 +110,7 @@ def fetch(repository: str) -> tuple[str, Path, str]:
                 f" {hub.hf_hub_url(repository, FILE)} by hand and set vggt=<that file>"
             ) from error
     path = Path(cached)
-    # The name of a file in the cache is the published checksum.
+    # The cache names files by their published checksums.
     digest = sha256(path)
     published = path.resolve().name
     is_whole = digest == published or not re.fullmatch(r"[0-9a-f]{64}", published)
@@ -145,14 +125,11 @@ def sha256(path: Path) -> str:
 
 
 def published_tensors(path: Path, entry: str | None = None) -> dict[str, Tensor]:
-    """All tensors of a file of published weights, mapped from the disk.
+    """All tensors of a file of published weights by published names, memory-mapped.
 
     Args:
-        path: the file.
-        entry: the key of the file that holds its tensors, if any.
-
-    Returns:
-        Tensors by published names.
+        path: path of the file.
+        entry: key under which the file holds its tensors, if any.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -172,17 +149,16 @@ def published_tensors(path: Path, entry: str | None = None) -> dict[str, Tensor]
 def match_names(
     model: Mapping[str, Tensor], tensors: Mapping[str, Tensor], table: Mapping[str, str], path: str | Path
 ) -> dict[str, str]:
-    """Published names of tensors by ours.
+    """Map our names of tensors to the published ones; names and shapes must match exactly.
 
     Args:
         model: the model's tensors by name.
-        tensors: published ones by name.
+        tensors: published tensors by name.
         table: our prefixes by published ones.
-        path: of the published ones, for messages.
+        path: file of the published tensors, for messages.
 
     Raises:
-        InputError: a name or a shape does not fit the model's tensors,
-            or two names mean one tensor.
+        InputError: a name or shape does not match the model, or two names map to one tensor.
     """
     used: dict[str, str] = {}
     for name, tensor in tensors.items():
@@ -207,24 +183,24 @@ def import_weights(
     release: str | None = None,
     dtype: str = "float32",
 ) -> list[str]:
-    """Write a checkpoint with published weights and nothing else.
+    """Write a checkpoint of published weights alone.
 
     Args:
-        state: tensors that the files must fill, on the meta device: those of the model, or without
-            ``release`` those of its encoder.
-        config: nodes of the model. Without ``release`` the checkpoint keeps that of the
+        state: tensors that the files must provide, on the meta device: those of the model, or,
+            without ``release``, of its encoder.
+        config: configuration of the model. Without ``release`` the checkpoint keeps the node of the
             encoder alone.
-        out: the checkpoint.
+        out: checkpoint to write.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
         release: the authors' checkpoint, with all other stages.
-        dtype: precision of the encoder, such as ``bfloat16``; heads are float32.
+        dtype: dtype of the encoder, such as ``bfloat16``; heads are float32.
 
     Returns:
-        A report: a line for each file, and without ``release`` one about the other stages.
+        A report with one line per file, and, without ``release``, one about the other stages.
 
     Raises:
         FileNotFoundError: a file is missing.
-        InputError: a tensor does not fit; names the file, the tensor and both shapes.
+        InputError: a tensor does not fit; the message names the file, the tensor and both shapes.
     """
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
     found = fetch(vggt) if is_repository(vggt) else (Path(vggt).name, Path(vggt), None)
@@ -242,7 +218,7 @@ def import_weights(
         wanted = {name: tensor for name, tensor in published.items() if name not in skipped}
         used = match_names(state, wanted, table, path)
         for ours, name in used.items():
-            # Depths and offsets of millimetres need the precision of the heads.
+            # Heads stay float32: depths and offsets must be accurate to millimetres.
             kind = getattr(torch, dtype) if ours.startswith("encoder.") else torch.float32
             tensors[ours] = published[name].to(kind)
             finite = bool(tensors[ours].isfinite().all())
@@ -265,15 +241,15 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
     """Write the tensors of a checkpoint, bit for bit, under their published names.
 
     Args:
-        checkpoint: of this package.
+        checkpoint: checkpoint of this package.
         vggt: file for the encoder (safetensors or PyTorch, by its suffix); None: not written.
         release: PyTorch file for all other stages; None: not written.
 
     Returns:
-        A report, a line for each file.
+        A report with one line per file.
 
     Raises:
-        InputError: both are None, or a tensor has no published name; then nothing is written.
+        InputError: both are None, or a tensor has no published name; nothing is written then.
     """
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
     content = read_checkpoint(checkpoint, whole=True)
@@ -304,12 +280,12 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | Non
     """Write tensors as safetensors or a PyTorch file, by the suffix of the path.
 
     Args:
-        path: of the file.
-        tensors: by name.
-        entry: key of the PyTorch file that holds them, if any.
+        path: path of the file.
+        tensors: tensors by name.
+        entry: key to store them under in a PyTorch file, if any.
 
     Raises:
-        InputError: ``entry`` is given for safetensors, which are not nested.
+        InputError: ``entry`` is given for safetensors, which cannot be nested.
     """
     if Path(path).suffix == ".safetensors":
         require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")

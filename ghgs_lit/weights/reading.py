@@ -1,7 +1,6 @@
 """Reading of safetensors and PyTorch files, with one-line errors for any other file.
 
-Tensors are mapped from the disk: only the pages that are used take memory,
-and the system can free them.
+Tensors are memory-mapped: only pages in use take memory, and the system can free them.
 """
 
 import pickle
@@ -15,42 +14,41 @@ from typing import TYPE_CHECKING, Any
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import resolved
 
-if TYPE_CHECKING:  # a missing file is refused before PyTorch is imported
+if TYPE_CHECKING:  # a missing file is reported without importing PyTorch
     from torch import Tensor
 
 #: Name of the checkpoint that comes with the package (docs/model_card.md).
 SHIPPED = "shipped"
-#: Its file.
+#: Path of that checkpoint.
 SHIPPED_FILE = Path(__file__).with_name("shipped.ckpt")
 ZIP = b"PK"  #: First bytes of a PyTorch file
 PICKLE = b"\x80"  #: First byte of a file of PyTorch before 1.6
-_ENCRYPTED = 1  # flag of a record
-_FLOATS = ("float64", "float32", "float16", "bfloat16")  # precisions of weights
+_ENCRYPTED = 1  # flag bit of a ZIP record
+_FLOATS = ("float64", "float32", "float16", "bfloat16")  # allowed dtypes of weights
 
 
 def file_of(path: str | Path) -> Path:
-    """The file of a checkpoint, which may be :data:`SHIPPED` or the folder of a run."""
+    """Resolve :data:`SHIPPED`, or the folder of a run (its last checkpoint), to a file."""
     file = SHIPPED_FILE if str(path) == SHIPPED else Path(path).expanduser()
     last = file / "checkpoints" / "last.ckpt"
     return last if last.is_file() else file
 
 
 def open_file(path: str | Path, whole: bool = False) -> Any:
-    """Content of a safetensors or PyTorch file; the first bytes tell the format.
+    """Read a safetensors or PyTorch file, recognised by its first bytes.
 
     No code in it is executed (``weights_only=True``).
 
     Args:
-        path: of the file, :data:`SHIPPED`, or the folder of a run, whose last weights count.
-        whole: read every byte of a PyTorch file once and refuse a damaged one (2 s for 1 GB).
+        path: path of the file, :data:`SHIPPED`, or the folder of a run, meaning its last checkpoint.
+        whole: read every byte of a PyTorch file once and reject a damaged one (2 s for 1 GB).
 
     Returns:
-        What the file holds; tensors are mapped from the disk,
-        except in files of PyTorch before 1.6.
+        The content; tensors are memory-mapped, except in files of PyTorch before 1.6.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: it has another format, is truncated, or holds code.
+        InputError: it has another format, is truncated or damaged, or contains code.
     """
     path = file_of(path)
     start = require_weights(path)
@@ -71,13 +69,10 @@ def _unfit(path: Path, found: str) -> InputError:
 
 
 def require_weights(path: str | Path) -> bytes:
-    """First bytes of a file that may hold weights.
+    """Return up to 64 first bytes of a file that may hold weights.
 
     Args:
         path: as for :func:`open_file`.
-
-    Returns:
-        Up to 64 bytes.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -87,7 +82,7 @@ def require_weights(path: str | Path) -> bytes:
     if path.is_dir():
         raise _unfit(path, "a directory")
     if not path.is_file():
-        resolved(path)  # refuses links that form a loop
+        resolved(path)  # rejects cyclic links
         raise FileNotFoundError(f"{path}: expected a file of weights; found none")
     with path.open("rb") as file:
         start = file.read(64)
@@ -97,19 +92,18 @@ def require_weights(path: str | Path) -> bytes:
 
 
 def require_records(path: Path, whole: bool) -> None:
-    """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them, or do not
-    fit their checksums.
+    """Reject a PyTorch file with compressed or encrypted records, which PyTorch does not write, or with
+    wrong checksums.
 
-    Mapped from the disk, compressed ones would be other numbers,
-    and unpacked they may fill the memory.
+    Memory-mapped, compressed records would give wrong numbers; unpacked, they may fill the memory.
 
     Args:
-        path: of a file in ZIP format.
-        whole: check those of tensors, too.
+        path: path of a file in ZIP format.
+        whole: check the checksums of tensors, too.
 
     Raises:
-        InputError: a record is compressed, encrypted or damaged,
-            or records claim more bytes than the file has.
+        InputError: a record is compressed, encrypted or damaged, or records claim more bytes than
+            the file has.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -139,7 +133,7 @@ def _open_torch(path: Path, mmap: bool) -> Any:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # foreign pickles are refused below
+            warnings.simplefilter("ignore")  # foreign pickles are rejected below
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
         text = str(error)
@@ -161,17 +155,17 @@ def _open_safetensors(path: Path) -> "dict[str, Tensor]":
 
 
 def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
-    """Refuse tensors that weights never are.
+    """Reject tensors that weights cannot be: sparse ones, floats of 8 bits, and expanded ones.
 
-    They are sparse, of 8 bits, or of fewer stored numbers than their shape says, which a copy would
-    expand without limit.
+    An expanded tensor stores fewer numbers than its shape implies, and a copy would use unlimited
+    memory.
 
     Args:
-        tensors: by name; values of other types are not looked at.
-        path: of their file, for messages.
+        tensors: tensors by name; values of other types are ignored.
+        path: path of their file, for messages.
 
     Raises:
-        InputError: names the file and the tensor.
+        InputError: the message names the file and the tensor.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Switches of ``compat=release``, with which the authors' code differs from the paper."""
+"""Switches of ``compat=release``: differences of the authors' code from the paper."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -12,7 +12,7 @@ from ghgs_lit.config.options import Options
 
 
 class CompatOptions(Options):
-    """Name of the code that a configuration reproduces; ``conf/compat`` sets the switches."""
+    """Name of the code that a configuration reproduces; the files in ``conf/compat`` set the switches."""
 
     group = "compat"
     name: Literal["none", "release"] = "none"
@@ -21,25 +21,22 @@ class CompatOptions(Options):
 
 @cache
 def release_switches() -> dict[tuple[str, ...], Any]:
-    """The release's value of each switch of the model, by (group, key)."""
+    """Value of each of the model's switches in the release, by (group, key)."""
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "compat" / "release.yaml"))
     switches = {}
     for group, values in node.items():
-        if group not in ("defaults", "compat", "renderer"):  # which are no parts of the model
+        if group not in ("defaults", "compat", "renderer"):  # these are not part of the model
             switches |= {(group, key): value for key, value in values.items()}
     return switches
 
 
 def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> list[str]:
-    """Switches in which a configuration differs from another.
+    """List the switches in which two configurations differ, as ``<key>=<value> for <other value>``.
 
     Args:
         config: the whole configuration.
-        other: another one; None: the release. Stages that it lacks, as a checkpoint of
-            ``ghgs pretext`` does, are not compared.
-
-    Returns:
-        A text ``<key>=<value> for <other value>`` for each.
+        other: the other one; None: the release. Stages missing from it (a checkpoint of
+            ``ghgs pretext`` lacks some) are not compared.
     """
     texts = []
     for (group, key), value in release_switches().items():
