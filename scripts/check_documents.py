@@ -1,23 +1,23 @@
-"""Run every command of the documentation as it is printed, document by document, in the order of the text.
+"""Run every command of the documentation as printed, document by document, in the order of the text.
 
     python scripts/check_documents.py                          # everything that can run here
     python scripts/check_documents.py README.md docs/data.md   # some documents
-    python scripts/check_documents.py --fast                   # what ends within seconds, and what that needs
-    python scripts/check_documents.py --list                   # what would be run, and what not and why
+    python scripts/check_documents.py --fast                   # fast commands and their prerequisites
+    python scripts/check_documents.py --list                   # list commands, and why some are excluded
 
-Commands are the lines of ``bash`` blocks, ``python`` blocks as a whole, and commands in running text. Each
-document gets an empty folder with links to what a checkout has. Three tables in ``document_commands.py`` list
-where runs differ from the text: NOT_RUN (left out, with the reason), SMALL (small settings, and stand-ins for
-files of the reader) and BEFORE (what a document expects to be there). One line is printed for each command;
-the exit code is 1 if one fails.
+Commands are the lines of ``bash`` blocks, whole ``python`` blocks, and commands in running text. Each
+document gets an empty folder with links to parts of the checkout. Three tables in
+``document_commands.py`` list where runs differ from the text: NOT_RUN (excluded, with the reason),
+SMALL (small settings, and stand-ins for the reader's files) and BEFORE (files that a document
+expects). One line is printed for each command; the exit code is 1 if one fails.
 
-Above a table of figures, in its section, stands what they are of (`none`: they depend on no such thing):
+A comment above a table of figures, in its section, states their origin (`none`: not applicable):
 
     <!-- figures: ghgs evaluate checkpoint=shipped; commit 96ee19c1; weights ce8df77b3fbf; people 2 -->
 
-The commit is the one that measured them, or at which they entered the documents; weights are the first
-digits of their digest, people the version of the frozen ones. Where one is not today's, the section must
-call them "older weights" or "older people", and lie in docs/evidence.
+The commit is the one that measured them, or that added them to the documents; weights are the first
+digits of their digest, people the version of the frozen ones. If one is not the current one, the
+section must mention "older weights" or "older people", and be in docs/evidence.
 """
 
 import argparse
@@ -46,21 +46,21 @@ from scripts.document_commands import BEFORE, FAST, GIVEN, NOT_RUN, SMALL
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT = 600  # seconds for one command
 
-#: What figures of today are of.
+#: Current weights and people, as in the comments above figures.
 TODAY = {
     "weights": digest_of(torch.load(SHIPPED_FILE, weights_only=True)["state_dict"])[:12],
     "people": str(definition("sealed")["version"]),
 }
 STAMP = r"<!-- figures: .+; commit (?P<commit>\w+); weights (?P<weights>\w+); people (?P<people>\w+) -->\n"
-#: Commits, one a line; empty where the history is not whole.
+#: Commits, one a line; empty if the history is incomplete.
 HISTORY = subprocess.run("git rev-list HEAD", shell=True, cwd=ROOT, capture_output=True, text=True).stdout
 HISTORY *= (ROOT / ".git").exists() and not (ROOT / ".git" / "shallow").exists()
-LEAST = 4  #: cells that begin with a decimal: the least of a table of figures
+LEAST = 4  #: a table with as many decimal cells is a table of figures
 
 
 @dataclass(frozen=True)
 class Command:
-    """One command of a document; ``text`` as printed, without continuation lines and comments."""
+    """A command of a document; ``text`` is as printed, without continuation lines and comments."""
 
     document: str
     line: int
@@ -73,12 +73,12 @@ class Command:
 
     @property
     def key(self) -> str:
-        """What the patterns of the tables are matched with."""
+        """Text that the patterns of the tables are matched against."""
         return "#python" if self.is_python else self.text
 
     @property
     def reason(self) -> str | None:
-        """Why it is not run; None: it is."""
+        """Reason for not running it; None: it is run."""
         return next((why for pattern, why in NOT_RUN if re.match(pattern, self.key)), None)
 
     @property
@@ -86,7 +86,7 @@ class Command:
         return self.document in FAST and re.match(FAST[self.document], self.key) is not None
 
     def script(self) -> tuple[str, list[str]]:
-        """What is run, and the reasons for which it differs from the text."""
+        """The script to run, and the reasons for its differences from the text."""
         given = GIVEN.get(self.document, "") if self.is_python else ""
         text, reasons = given + self.text, []
         for pattern, instead, why in SMALL:
@@ -97,13 +97,13 @@ class Command:
 
 
 def documents() -> list[str]:
-    """All documents that have commands, relative to the repository."""
+    """All documents, relative to the repository."""
     found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [path.relative_to(ROOT).as_posix() for path in found]
 
 
 def commands(document: str) -> list[Command]:
-    """The commands of a document in the order of the text; repeated ones count once."""
+    """The commands of a document in the order of the text, without repetitions."""
     text = (ROOT / document).read_text()
     found = [*_in_blocks(document, text), *_in_prose(document, text)]
     first: dict[str, Command] = {}
@@ -131,8 +131,7 @@ def _in_blocks(document: str, text: str) -> Iterator[Command]:
 
 
 def _in_prose(document: str, text: str) -> Iterator[Command]:
-    """Code spans that begin like a command and have an argument;
-    names of verbs alone are not run."""
+    """Code spans that begin like a command and have an argument."""
     prose = _without_blocks(text)
     program = r"(?:ghgs --help|ghgs\s\w+\s\S*(?:=|--help)|python \w+/|make \w|pip install|tensorboard )"
     for span in re.finditer(rf"(?<!`)`((?:\w+=\S+ )?{program}[^`]*)`(?!`)", prose):
@@ -144,7 +143,7 @@ def _without_blocks(text: str) -> str:
 
 
 def stale_figures(document: str) -> list[str]:
-    """Find tables of figures that are not of today's weights and people, and commits that do not exist.
+    """Find tables of figures without origin or with outdated weights or people, and unknown commits.
 
     Args:
         document: relative to the repository.
@@ -176,7 +175,7 @@ def _faults_of(stamp: re.Match | None, section: str, document: str) -> list[str]
 
 
 class Reader:
-    """Runs commands in a folder of its own, as a reader of one document would."""
+    """Run the commands of one document in a separate folder, as its reader would."""
 
     def __init__(self, folder: Path, document: str) -> None:
         self.folder = folder / document.replace("/", "_").removesuffix(".md")
@@ -196,7 +195,7 @@ class Reader:
         self.exported: list[str] = []
 
     def run(self, text: str, is_python: bool = False) -> tuple[int, float, str]:
-        """Exit code, seconds and output of a command."""
+        """Run a command; return exit code, seconds and output."""
         script = "\n".join(["set -e", *self.exported, text])
         argv = [sys.executable, "-c", text] if is_python else ["bash", "-c", script]
         start = time.monotonic()
@@ -218,12 +217,12 @@ def check(document: str, folder: Path, fast: bool = False, listed: bool = False)
 
     Args:
         document: relative to the repository.
-        folder: where the document's folder is made.
-        fast: only what ends within seconds.
-        listed: only print what would be run.
+        folder: parent of the document's folder.
+        fast: only commands that end within seconds.
+        listed: only print the commands.
 
     Returns:
-        How many commands ran, failed, and were left out.
+        Numbers of commands that ran, failed, and were not run.
     """
     count: Counter = Counter()
     chosen = [c for c in commands(document) if not fast or (c.is_fast and c.reason is None)]

@@ -1,8 +1,8 @@
-"""Compiles what runs on the CPU for this processor: `make setup` calls it, so that no first command waits.
+"""Compile all CPU kernels for this processor, as part of `make setup`, so that first commands start fast.
 
-A prediction and its refinement by the weights that come with the package use all kernels but those of large
-encoders. The rasterizer's take longest: another process compiles them. The machine code is kept beside the
-package, or in NUMBA_CACHE_DIR.
+A prediction and its refinement by the shipped weights use all kernels except those of large encoders.
+The rasterizer's kernels take longest and are compiled in a second process. Machine code is cached
+next to the package, or in NUMBA_CACHE_DIR.
 """
 
 from multiprocessing import get_context
@@ -20,7 +20,7 @@ BATCH = ellipsoid_batch(0.15, 4, 56, 1)
 
 
 def draw() -> None:
-    """An image, and its gradients."""
+    """Render an image and compute its gradients."""
     parts = (torch.rand(99, 3) - 0.5, torch.rand(99, 4), torch.rand(99, 3) / 9, torch.rand(99))
     gaussians = Gaussians(*(part.requires_grad_() for part in (*parts, torch.rand(99, 3))), (99,))
     Renderer()(gaussians, BATCH.cameras).image.sum().backward()
@@ -31,7 +31,7 @@ if __name__ == "__main__":
     drawing.start()
     predictor = Predictor.from_checkpoint()
     model = predictor.model
-    rounds, model.rounds = model.rounds, NoRounds()  # they draw
+    rounds, model.rounds = model.rounds, NoRounds()  # they render
     with torch.no_grad():
         predictor(BATCH)
     model.rounds = rounds

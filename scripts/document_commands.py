@@ -1,4 +1,4 @@
-"""How the commands of documents are run: which are left out, with what settings, and on what files.
+"""Rules for running the commands of documents: exclusions, settings and prepared files.
 
 :mod:`scripts.check_documents` runs them.
 """
@@ -7,7 +7,7 @@ import importlib.util
 
 PUBLISHED = "needs published weights"
 NETWORK = "needs a package index"
-# A pattern at the beginning of a command, and why such a command is not run.
+# Pattern of the beginning of a command, and the reason for not running it.
 NOT_RUN = [
     (r"make (?!demo$|bench$)", "sets up an environment, or is what continuous integration runs"),
     (r"\w+=\S+ make demo", NETWORK),
@@ -38,8 +38,8 @@ CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
 TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1 data.render_workers=0"
 SHORT = "trainer.max_steps=2 trainer.val_check_interval=2 trainer.limit_val_batches=1"
 FEW = "--size 128 --train 2 --val 1"
-TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a command that trains
-# A pattern, what is put in its place, and why.
+TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # beginning of the pattern of a training command
+# Pattern, replacement and reason.
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
     (r"^bash scripts/demo\.sh$", f"bash scripts/demo.sh {TINY} {SHORT}", "two steps"),
@@ -98,7 +98,7 @@ _CHECKPOINTS = (
     f"{_RUN} hydra.run.dir=runs/mine",
     *(f"cp runs/mine/checkpoints/last.ckpt {n}.ckpt" for n in "ab"),
 )
-# Photographs of static cameras in the layout of docs/template, from rendered scans.
+# Photographs of static cameras from rendered scans, in the layout of docs/template.
 _PHOTOGRAPHS = """python - <<'END'
 from pathlib import Path
 import numpy as np
@@ -119,7 +119,7 @@ for phase in ("train", "val"):
         np.savez(folder / "cameras.npz", **cameras)
         np.save(folder / "body.npy", np.random.default_rng(0).normal(size=(99, 3)) * 0.2)
 END"""
-# The same as the photographs of a user: a folder of photographs, one of masks, and a calibration.
+# Rendered scans as a user's capture: a folder of photographs, one of masks, and a calibration.
 _CAPTURE = """python - <<'END'
 import json, shutil
 from pathlib import Path
@@ -138,7 +138,7 @@ for instant in "12":
     shutil.copytree("photographs", f"instants/{instant}")
     shutil.copytree("masks", f"instant_masks/{instant}")
 END"""
-# A document, and the commands that make what its reader has.
+# Documents, with commands that create the files that a document requires.
 BEFORE = {
     "docs/data.md": (
         f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW}",
@@ -166,7 +166,7 @@ BEFORE = {
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (f"{_RUN} hydra.run.dir=runs/before", _SWEEP),
 }  # fmt: skip
-# Names that Python blocks of a document take as given.
+# Definitions for Python blocks of a document.
 GIVEN = {
     "docs/rasterizer.md": """
 import torch
@@ -176,7 +176,7 @@ gaussians = Gaussians(near, torch.rand(50, 4), torch.rand(50, 3) / 9, one / 2, t
 cameras = Cameras(torch.tensor([[[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]]), torch.eye(4)[None, None], 32, 32)
 """,
 }
-# Beginnings of the commands of a document that end within seconds, and of those that they need.
+# Patterns of the commands of a document that end within seconds, and of their prerequisites.
 FAST = {
     "README.md": r"ghgs train --help|.*dry_run=true|.*data\.source=my_scans|"
     r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|"

@@ -1,12 +1,12 @@
-"""Train a small sweep whose processes are killed at random, moved and queued again, and check the result.
+"""Train a small sweep whose processes are killed at random, moved and requeued, and check the result.
 
     python scripts/drill.py --out runs/drill [--kills 10] [--steps 60] [--random 0] [overrides of ghgs train]
 
-Two processes share twelve runs. They are killed while they train by SIGKILL, SIGTERM or SIGINT; once all are
-killed and the sweep's folder is moved, and once a job of SLURM (the environment of ``srun``, a replacement of
-``scontrol``) is stopped by SIGUSR1 and queued again. Then each run must have been trained once, with the last
-and the best checkpoint, logs of every step once, and a place in the table; one is compared bit by bit with an
-undisturbed run. Exits with 1 and says what is wrong.
+Two processes share twelve runs. They are killed in training by SIGKILL, SIGTERM or SIGINT. Once, all
+are killed and the sweep's folder is moved; once, a SLURM job (the environment of ``srun``, a stand-in
+for ``scontrol``) is stopped by SIGUSR1 and requeued. Then each run must have been trained once, with
+the last and the best checkpoint, one log entry per step, and a place in the table; one is compared
+bit by bit with an undisturbed run. Prints all faults, and exits with 1 if there are any.
 """
 
 import argparse
@@ -36,13 +36,13 @@ JOB |= {"SLURM_JOB_NODELIST": "localhost"}
 
 
 class Drill:
-    """The sweep's folder, its two processes and what is done to them."""
+    """The sweep's folder and its two processes."""
 
     def __init__(self, out: Path, steps: int, overrides: list[str]):
         overrides = [f"trainer.max_steps={steps}", *overrides]
         self.out, self.overrides, self.sweep = out, overrides, out / "sweep"
         self.processes: list[subprocess.Popen] = []
-        self.requests = out / "requests"  # of the replacement of scontrol
+        self.requests = out / "requests"  # written by the stand-in for scontrol
         (out / "bin").mkdir(parents=True)
         (out / "bin" / "scontrol").write_text(f'#!/bin/bash\necho "$@" >> {self.requests.resolve()}\n')
         (out / "bin" / "scontrol").chmod(0o755)
@@ -62,13 +62,12 @@ class Drill:
         return self.ghgs("train", "-m", *SETTINGS, *grid, cache, *self.overrides, where, **environment)
 
     def start_two(self) -> None:
-        """Start processes until two run; those that have ended by themselves must have
-        succeeded."""
+        """Start processes until there are two, including ended ones; :meth:`finish` checks exit codes."""
         while len(self.processes) < 2:
             self.processes.append(self.train(self.sweep))
 
     def session_of(self, process: subprocess.Popen) -> dict | None:
-        """The present session of a process; None: it does not train."""
+        """The current session of a process; None: it is not training."""
         for path in self.sweep.glob("*/sessions.jsonl"):
             lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
             if lines and lines[-1].get("pid") == process.pid:
@@ -86,7 +85,7 @@ class Drill:
         self.processes.remove(process)
 
     def kill(self, kills: int, chance: random.Random) -> None:
-        """Kill one of the two processes in its training, again and again, and start another one."""
+        """Kill one of the two processes in training ``kills`` times, and start another one each time."""
         for count in range(kills):
             self.start_two()
             victim = chance.choice(self.processes)
@@ -130,7 +129,7 @@ def steps_of_csv(run: Path, name: str) -> list[tuple[int, float]]:
 
 
 def steps_of_tensorboard(folder: Path, name: str) -> list[int]:
-    """Steps of a tag in all event files as they are, without what TensorBoard would leave out."""
+    """Steps of a tag in all event files, including events that TensorBoard would discard."""
     events = [e for path in folder.glob("events.*") for e in EventFileLoader(str(path)).Load()]
     return sorted(e.step for e in events for value in e.summary.value if value.tag == name)
 
@@ -142,7 +141,7 @@ def curves_of(sweep: Path, run: Path) -> Path:
 
 
 def faults_of(sweep: Path, run: Path, steps: int) -> list[str]:
-    """What is wrong with a run that has ended."""
+    """Faults of a completed run."""
     every, validations = list(range(1, steps + 1)), list(range(VALIDATION, steps + 1, VALIDATION))
     results = json.loads((run / "metrics.json").read_text())
     sessions = [json.loads(line) for line in (run / "sessions.jsonl").read_text().splitlines()]
@@ -182,8 +181,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=60, help="of each run; fewer on a slow machine")
     parser.add_argument("--random", type=int, default=0, help="seed of what is killed and when")
     arguments, overrides = parser.parse_known_args()
-    # A shell starts what it puts into the background with Ctrl-C ignored,
-    # and children inherit that.
+    # A shell starts background jobs with SIGINT ignored, which children inherit.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if arguments.out.exists():
         raise SystemExit(f"{arguments.out}: expected a new directory; found one")

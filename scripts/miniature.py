@@ -1,10 +1,10 @@
-"""A small data set of built-in people in a published layout, to try its loader without the real data.
+"""Write a small data set of built-in people in a published layout, to try its loader.
 
     python scripts/miniature.py data=humman data.root=humman --train 2 --val 2
 
-Takes the keys of ``ghgs prepare``: ``data`` says which layout, ``data.root`` where. With ``data=thuman2
-data.source=my_scans`` raw scans are written, with ``data.root`` renders of them. A folder that holds
-anything but a miniature is refused. Prints the folders that were written.
+Keys are those of ``ghgs prepare``: ``data`` selects the layout, ``data.root`` the folder.
+``data=thuman2 data.source=my_scans`` writes raw scans, ``data.root`` renders of them. A folder with
+anything but a miniature is rejected. Prints the folders that were written.
 """
 
 import argparse
@@ -26,10 +26,19 @@ from scripts.miniatures.scans import mark
 
 
 def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Write a small data set that the reader of ``dataset`` reads; returns the folders that were
-    written. ``people``: number of people of each phase. ``size``: longer side of the photographs in
-    pixels. InputError: no layout is published for the data set, it has no folder, or the folder
-    holds anything but a miniature."""
+    """Write a small data set for the reader of ``dataset``.
+
+    Args:
+        people: number of people of each phase.
+        size: longer side of the photographs in pixels.
+
+    Returns:
+        The folders that were written.
+
+    Raises:
+        InputError: the data set has no published layout or no folder, or the folder has anything but
+            a miniature.
+    """
     for kind, make in _MAKERS.items():
         if isinstance(dataset, kind):
             return make(dataset, people, size, seed)
@@ -56,8 +65,7 @@ def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) ->
 
 
 def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Renders as the published scripts make them;
-    with ``data.source`` raw scans with their fits."""
+    """Write renders as the published scripts do; with ``data.source``, raw scans with their fits."""
     if dataset.source is not None:
         source = dataset.source_folder
         mark(source, scans.fit_folder(source))
@@ -75,7 +83,7 @@ _MAKERS: dict[type[DataSet], Callable[..., list[Path]]] = {
 
 
 def main() -> None:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--train", type=int, default=4, help="people of training")
     parser.add_argument("--val", type=int, default=2, help="people of validation")

@@ -1,8 +1,9 @@
-"""The pictures of README and model card: ``python scripts/pictures.py docs``.
+"""Create the pictures of README and model card: ``python scripts/pictures.py docs``.
 
-``hero.png`` and ``turntable.webp``: a built-in person who was not trained on, photographed from four sides
-before white, and the prediction from directions half-way between the cameras. ``result.png``: photographs,
-depths and renderings of two others. ``failures.jpg``: those of ``--people`` with the least PSNR half-way.
+``hero.png`` and ``turntable.webp``: a built-in person who was not trained on, photographed from four
+sides, and the prediction, rendered half-way between the cameras and all around, on white.
+``result.png``: photographs, depths and renderings of two others. ``failures.jpg``: those of
+``--people`` with the lowest PSNR half-way between the cameras.
 """
 
 import argparse
@@ -26,8 +27,7 @@ from ghgs_lit.visualization.pictures import ERROR_GAIN, colorize, error_map, row
 from ghgs_lit.visualization.turntable import orbit, subject_points
 
 SIDE, WIDTH, FRAMES = 512, 320, 36
-#: Where the hero looks from, degrees from the first photograph,
-#: which is 90 degrees from the second.
+#: Directions of the renders in hero.png, in degrees from the first photograph; the second one is at 90.
 BETWEEN = (45, 135, 225, 315)
 
 
@@ -35,7 +35,7 @@ def people(number: int, size: int) -> PhotographsDataModule:
     """Built-in people of the split val, rendered on first use.
 
     Args:
-        number: of people.
+        number: number of people.
         size: side of the photographs in pixels.
     """
     overrides = [
@@ -51,7 +51,7 @@ def people(number: int, size: int) -> PhotographsDataModule:
 
 
 def drawn(prediction: Prediction, batch: Batch) -> Tensor:
-    """The rendering of the batch's target [3, h, w]."""
+    """Render the first target [3, h, w] of the batch."""
     return Renderer()(prediction.gaussians, batch.targets.cameras[:, :1]).image[0, 0].clamp(0, 1)
 
 
@@ -60,7 +60,7 @@ def on_white(color: Tensor, alpha: Tensor) -> np.ndarray:
 
 
 def box_of(mask: Tensor, ratio: float) -> tuple[slice, slice]:
-    """Rows and columns of a subject with a margin.
+    """Rows and columns of a box around a subject, with a margin.
 
     Args:
         mask: [h, w] bool.
@@ -75,12 +75,12 @@ def box_of(mask: Tensor, ratio: float) -> tuple[slice, slice]:
 
 
 def cut(picture: np.ndarray, box: tuple[slice, slice], size: tuple[int, int]) -> np.ndarray:
-    """The part of a picture in a box, as (width, height) pixels."""
+    """Crop a picture to a box and resize it to ``size``, (width, height) in pixels."""
     return np.asarray(Image.fromarray(picture[box]).resize(size, Image.Resampling.LANCZOS))
 
 
 def turned(gaussians: Gaussians, capture: Batch, degrees: list[float]) -> list[np.ndarray]:
-    """Renders of :data:`SIDE` pixels before white from directions around the subject."""
+    """Render views of :data:`SIDE` pixels on white from directions around the subject."""
     angles = torch.tensor(degrees, dtype=torch.float64) * (math.pi / 180)
     cameras = orbit(capture.cameras[0], angles, subject_points(gaussians))
     intrinsics = cameras.intrinsics.clone()
@@ -130,7 +130,7 @@ def result(batch: Batch, prediction: Prediction) -> np.ndarray:
 
 
 def comparison(batch: Batch, image: Tensor, size: tuple[int, int]) -> np.ndarray:
-    """Target, rendering and error half-way between two photographs, as (width, height) pixels."""
+    """Target, rendering and error half-way between two cameras, as (width, height) pixels."""
     target = batch.targets.images[0, 0]
     box = box_of(batch.targets.masks[0, 0], size[0] / size[1])
     tiles = [cut(one, box, size) for one in (to_uint8(target), to_uint8(image), error_map(image, target))]

@@ -1,1 +1,1 @@
-"""Small data sets of built-in people in the published layouts, to try a loader without the real data."""
+"""Small data sets of built-in people in published layouts, to try loaders without the real data."""

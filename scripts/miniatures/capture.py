@@ -1,4 +1,4 @@
-"""Shared by the miniatures: cameras around a person, people moved about, studios and image files."""
+"""Common parts of the miniatures: cameras around a person, rigid motions, studios and image files."""
 
 from pathlib import Path
 
@@ -12,8 +12,7 @@ from ghgs_people.figures.mesh import Person
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """World to camera [4, 4] of an upright camera at ``center`` that looks at ``target``
-    (OpenCV axes)."""
+    """World-to-camera matrix [4, 4] of an upright camera at ``center`` facing ``target`` (OpenCV axes)."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
@@ -24,7 +23,7 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
 
 
 def ring(count: int, radius: float, height: float, rng: np.random.Generator) -> np.ndarray:
-    """Centres [count, 3] of cameras in order around the y axis, with random deviations."""
+    """Camera centres [count, 3] in order around the y axis, with random deviations, in metres."""
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.15, 0.15, count)) / count
     radii = radius * rng.uniform(0.93, 1.07, count)
     heights = height + rng.uniform(-0.35, 0.35, count)
@@ -40,19 +39,19 @@ def rigid(degrees: float, translation: np.ndarray) -> np.ndarray:
 
 
 def moved(person: Person, pose: np.ndarray) -> Person:
-    """``person`` in another frame: ``pose`` [4, 4] maps old to new."""
+    """``person`` in another frame: ``pose`` [4, 4] maps old to new coordinates."""
     return person.mapped(lambda vertices: vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
 def cameras_of(matrices: np.ndarray, poses: np.ndarray, height: int, width: int) -> Cameras:
-    """Cameras, float32, of intrinsics [n, 3, 3] and world-to-camera poses [n, 4, 4]."""
+    """Float32 cameras from intrinsics [n, 3, 3] and world-to-camera poses [n, 4, 4]."""
     return Cameras(*(torch.from_numpy(array).float() for array in (matrices, poses)), height, width)
 
 
 def before_wall(image: np.ndarray, mask: np.ndarray, brightness: float) -> np.ndarray:
-    """A photograph [h, w, 3] in [0, 1] of a person, 0 to 255 in front of a studio.
+    """Compose an image [h, w, 3] in [0, 1] of a person with a studio, in [0, 255].
 
-    The studio has a grey wall over a brown floor, so that it shows when a mask is not applied.
+    The studio is a grey wall above a brown floor, so that unmasked background is visible.
     """
     rows = np.linspace(0, 1, len(mask))[:, None, None]
     wall = np.array([150, 155, 160]) * (0.8 + 0.3 * rows) * brightness
@@ -62,7 +61,7 @@ def before_wall(image: np.ndarray, mask: np.ndarray, brightness: float) -> np.nd
 
 
 def save_image(path: Path, image: np.ndarray | Image.Image, quality: int = 95) -> None:
-    """Write an image, making its folder; ``quality`` counts for JPEG."""
+    """Write an image and create its folder; ``quality`` applies to JPEG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     image = image if isinstance(image, Image.Image) else Image.fromarray(image)
     image.save(path, quality=quality)

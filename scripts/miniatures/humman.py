@@ -1,9 +1,9 @@
-"""A small HuMMan-Recon v1.0 of built-in people: folders, names, dtypes, units and oddities of the real one.
+"""A small HuMMan-Recon v1.0 of built-in people, with the names, dtypes, units and oddities of the real one.
 
-Ten Kinects; photographs of 16:9 in front of a wall; masks with soft edges; frame numbers that are multiples
-of 6, one of them missing; the world frame is that of camera 0. Textured meshes and the depth cameras, which
-nothing reads, are not made. A stand-in for the licensed
-SMPL model is written beside the root.
+Ten Kinects; photographs of 16:9 in front of a wall; masks with soft edges; frame numbers that are
+multiples of 6, one of them missing; the world frame is that of camera 0. Textured meshes and the
+depth cameras, which no loader reads, are not written. A stand-in for the licensed SMPL model is
+written next to the root.
 """
 
 import json
@@ -42,14 +42,13 @@ def make(
     Args:
         root: folder of the sequences.
         test: names of the test sequences.
-        people_of: how many sequences, ``{train: n, val: n}``.
+        people_of: numbers of sequences, ``{train: n, val: n}``.
         size: longer side of the photographs in pixels.
         seed: of people, cameras and lights.
-        frames: their numbers.
+        frames: frame numbers.
 
     Returns:
-        The folders of the sequences, and last that of the stand-in for SMPL,
-        ``<root>_body_models``.
+        The folders of the sequences, and last that of the stand-in for SMPL, ``<root>_body_models``.
     """
     training = [f"p{100001 + 7 * i:06d}_a{48 + 11 * i:06d}" for i in range(people_of["train"])]
     folders = []
@@ -62,7 +61,7 @@ def make(
 
 
 def body_models(root: Path) -> Path:
-    """The folder of the stand-in for SMPL, beside the sequences in ``root``."""
+    """The folder of the stand-in for SMPL, next to ``root``."""
     return root.with_name(f"{root.name}_body_models")
 
 
@@ -98,7 +97,7 @@ def _rig(scale: float, rng: np.random.Generator) -> Cameras:
 
 
 def _write_cameras(folder: Path, cameras: Cameras, from_world: torch.Tensor) -> None:
-    """Write ``cameras.json``: pixel centres at integers, the world frame is the first camera's."""
+    """Write ``cameras.json``, with pixel centres at integers; the world frame is the first camera's."""
     content = {}
     for k in range(KINECTS):
         matrix = cameras.intrinsics[k].double()

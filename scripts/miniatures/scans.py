@@ -1,9 +1,9 @@
-"""Built-in people as a few scans of THuman2.0, with their fits.
+"""Built-in people as scans of THuman2.0, with their fits.
 
-Names, types, shapes and units are those of the real files (:mod:`ghgs_people.thuman2`). Bodies
-are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and
-place the body correctly, but do not pose it. Folders that are written get a mark, so that real data
-of the same names is never overwritten.
+Names, types, shapes and units are those of the real files (:mod:`ghgs_people.thuman2`). Bodies are
+MakeHuman's instead of SMPL-X's: the parameters in ``smplx_param.pkl`` have the right shapes and place
+the body correctly, but do not pose it. Written folders are marked, so that real data of the same
+names is never overwritten.
 """
 
 import pickle
@@ -24,7 +24,7 @@ from ghgs_people.figures.generate import join
 from ghgs_people.figures.mesh import TexturedMesh
 from ghgs_people.thuman2 import FIT_FOLDERS
 
-#: A file in each folder that a miniature was written to.
+#: Name of the file that marks folders of miniatures.
 MARKER = "miniature"
 # Id of the first scan of each phase.
 _FIRST = {"train": 0, "val": 426}
@@ -34,7 +34,10 @@ POSE_SIZES |= {"leye_pose": 3, "reye_pose": 3, "expression": 10}
 
 def mark(*folders: Path) -> None:
     """Mark folders as a miniature's before they are written.
-    InputError: one holds files and has no mark."""
+
+    Raises:
+        InputError: a folder has files but no mark.
+    """
     for folder in folders:
         marked = (folder / MARKER).is_file() or not folder.is_dir()
         found = [] if marked else sorted(path.name for path in folder.iterdir())
@@ -48,12 +51,12 @@ def mark(*folders: Path) -> None:
 
 
 def fit_folder(source: Path) -> Path:
-    """The folder of the fits, beside the scans in ``source``."""
+    """The folder of the fits, next to ``source``."""
     return source.parent / FIT_FOLDERS[0]
 
 
 def names(people_of: Mapping[str, int]) -> dict[str, list[str]]:
-    """Ids of each phase: ``0000`` on for training, ``0426`` on for validation."""
+    """Ids of each phase: from ``0000`` for training, from ``0426`` for validation."""
     for phase, count in people_of.items():
         limit = 426 if phase == "train" else 100
         require(0 <= count <= limit, f"--{phase}", f"between 0 and {limit}", count)
@@ -62,7 +65,7 @@ def names(people_of: Mapping[str, int]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Scan:
-    """A person as one mesh in a scan's frame, with the fit that maps the body [n, 3] to it;
+    """A person as one mesh in a scan's frame, with the fit that maps the body [n, 3] to it; yaw in
     radians."""
 
     mesh: TexturedMesh
@@ -74,7 +77,7 @@ class Scan:
 
 @lru_cache(maxsize=4)
 def scan_of(name: str, seed: int) -> Scan:
-    """Person number ``int(name)``, turned by a random yaw, in units that are not metres."""
+    """Person number ``int(name)``, rotated by a random yaw, in units other than metres."""
     person = figures.generate(seed, int(name))
     rng = subject_rng(seed, name)
     yaw = float(rng.uniform(-np.pi, np.pi))
@@ -90,12 +93,11 @@ def scan_of(name: str, seed: int) -> Scan:
 
 
 def make_scans(source: Path, people_of: Mapping[str, int], size: int, seed: int) -> Path:
-    """Write scans into ``source``, their fits into a folder beside it, and split files;
-    returns ``source``.
+    """Write scans and split files into ``source``, and their fits next to it; return ``source``.
 
     Args:
-        people_of: how many, ``{train: n, val: n}``.
-        size: textures are scaled down to at most twice as many pixels a side.
+        people_of: numbers of scans, ``{train: n, val: n}``.
+        size: textures are downsampled to at most ``2 * size`` pixels a side.
     """
     listed = names(people_of)
     for name in (name for phase in listed.values() for name in phase):

@@ -1,7 +1,7 @@
-"""A stand-in for the licensed SMPL model, made from the built-in body, and parameters of built-in people.
+"""A stand-in for the licensed SMPL model, made from the built-in body, and SMPL parameters of people.
 
-It has SMPL's arrays, shapes and 24 joints, so that ``smplx`` can pose it, but none of its data: shape blend
-shapes are the first ten components of the built-in body, pose blend shapes are zero.
+It has SMPL's arrays, shapes and 24 joints, so that ``smplx`` can pose it, but none of its data: shape
+blend shapes are the first ten components of the built-in body, pose blend shapes are zero.
 """
 
 import pickle
@@ -17,8 +17,7 @@ from ghgs_people.figures.generate import pose_figure
 from ghgs_people.figures.mesh import Person
 
 VERTICES, SHAPES = 6890, 10
-# The joints of SMPL in order: the built-in bone that starts at each,
-# and the index of the parent joint.
+# The joints of SMPL in order: the built-in bone that starts there, and the index of the parent joint.
 JOINTS = (
     ("root", -1), ("upperleg01.L", 0), ("upperleg01.R", 0), ("spine05", 0), ("lowerleg01.L", 1),
     ("lowerleg01.R", 2), ("spine03", 3), ("foot.L", 4), ("foot.R", 5), ("spine01", 6), ("toe2-1.L", 7),
@@ -27,12 +26,12 @@ JOINTS = (
     ("finger3-1.L", 20), ("finger3-1.R", 21),
 )  # fmt: skip
 PARENTS = np.array([parent for _, parent in JOINTS])
-# How many of the nearest vertices a joint is regressed from.
+# Number of nearest vertices that a joint is regressed from.
 _NEAR = 150
 
 
 def chosen_vertices() -> np.ndarray:
-    """Indices [6890] of the built-in body's vertices that the stand-in has."""
+    """Indices [6890] of the stand-in's vertices in the built-in body."""
     return np.linspace(0, BODY_VERTICES - 1, VERTICES).astype(int)
 
 
@@ -53,7 +52,7 @@ def stand_in() -> dict[str, np.ndarray]:
 
 
 def write_stand_in(folder: Path) -> Path:
-    """Write ``<folder>/smpl/SMPL_NEUTRAL.pkl``, where ``smplx`` looks for it; return ``folder``."""
+    """Write ``<folder>/smpl/SMPL_NEUTRAL.pkl``, the path that ``smplx`` expects; return ``folder``."""
     path = folder / "smpl" / "SMPL_NEUTRAL.pkl"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as stream:
@@ -62,8 +61,7 @@ def write_stand_in(folder: Path) -> Path:
 
 
 def parameters(seed: int, index: int, person: Person, pose: np.ndarray) -> dict[str, np.ndarray]:
-    """SMPL parameters of ``people.generate(seed, index)`` moved by ``pose`` [4, 4],
-    as HuMMan stores them."""
+    """SMPL parameters of ``figures.generate(seed, index)`` moved by ``pose`` [4, 4], as in HuMMan."""
     body = load_body()
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(4)]
     coefficients, _, _ = body.sample_shape(streams[0])
@@ -90,8 +88,7 @@ def parameters(seed: int, index: int, person: Person, pose: np.ndarray) -> dict[
 
 
 def _regressor(body: BodyModel, chosen: np.ndarray, joint: int) -> np.ndarray:
-    """Weights [6890] of the vertices near a joint, summing to 1,
-    whose mean is the joint for every shape."""
+    """Weights [6890] of vertices near a joint, summing to 1, whose mean is the joint for every shape."""
     distance = np.linalg.norm(body.mean[chosen] - body.mean[joint], axis=-1)
     near = np.argsort(distance)[:_NEAR]
     shapes = np.concatenate((body.mean[None], body.components[:SHAPES]))
@@ -103,8 +100,7 @@ def _regressor(body: BodyModel, chosen: np.ndarray, joint: int) -> np.ndarray:
 
 
 def _weights(body: BodyModel) -> np.ndarray:
-    """Skinning weights [n, 24]: every bone counts for the nearest joint of SMPL above it
-    in the rig."""
+    """Skinning weights [n, 24]: each bone belongs to its nearest ancestor that is a joint of SMPL."""
     joint_of = {body.bone(name): j for j, (name, _) in enumerate(JOINTS)}
     weights = np.zeros((body.vertex_count, len(JOINTS)))
     for bone in range(len(body.bone_names)):

@@ -1,4 +1,4 @@
-"""A small THuman2.0 of built-in people, rendered as the published scripts do.
+"""A small THuman2.0 of built-in people, rendered as by the published scripts.
 
 Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.data.layout`); people are
 those of :mod:`scripts.miniatures.scans`.
@@ -31,20 +31,20 @@ def make(
     vids: Sequence[int] = get_args(ViewNumber),
     positions: int = 16,
 ) -> Path:
-    """Write renders below ``root`` in the layout that the published scripts make.
+    """Write renders below ``root`` in the layout of the published scripts.
 
-    In it pixel centres are at integers, the principal point is 25/1024 of the side below the
-    middle, masks have three channels, inverse depth is truncated (not rounded) to 16 bits,
-    extrinsics are 3 x 4, the views between cameras also have photographs of twice the size
-    (``<view>_hr.jpg``), and bodies lie in ``smpl`` with their normals.
+    Pixel centres are at integers, the principal point is 25/1024 of the side below the middle, masks
+    have three channels, inverse depth is truncated (not rounded) to 16 bits, extrinsics are 3 x 4,
+    the views between cameras also have photographs of twice the size (``<view>_hr.jpg``), and bodies
+    are in ``smpl`` with their normals.
 
     Args:
         root: folder of the phases.
-        people: how many, ``{train: n, val: n}``.
+        people: numbers of people, ``{train: n, val: n}``.
         size: side of the square photographs in pixels.
         seed: of people, cameras and lights.
         vids: the views at each position.
-        positions: how many around the subject.
+        positions: number of positions around the subject.
 
     Returns:
         ``root``.

@@ -1,4 +1,4 @@
-"""A small ZJU-MoCap of built-in people: folders, names, dtypes, units and oddities of the real one.
+"""A small ZJU-MoCap of built-in people, with the names, dtypes, units and oddities of the real one.
 
 Photographs are taken through distorting lenses in front of a grey wall. ``mask_cihp`` and ``mask``
 both have holes; their union has none. ``vertices`` fits worse than ``new_vertices``. The parameters
@@ -26,7 +26,7 @@ from scripts.miniatures.smpl import chosen_vertices
 OLD = ("313", "315")
 OLD_CAMERAS = (*range(1, 20), 22, 23)
 NEW_CAMERAS = tuple(range(1, 24))
-# In built-in people y is up, in ZJU-MoCap z.
+# Built-in people have y up, ZJU-MoCap has z up.
 _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 # Labels of the parsing model (hair, face, upper clothes, trousers, shoes) from top to bottom.
 _LABELS = np.array([2, 13, 5, 5, 5, 9, 9, 9, 9, 18], np.uint8)
@@ -40,7 +40,7 @@ def make(root: Path, sequences: Sequence[str], size: int = 256, seed: int = 0, f
         sequences: ids such as 377.
         size: side of the square photographs in pixels.
         seed: of people, cameras and lights.
-        frames: how many per sequence.
+        frames: number of frames per sequence.
 
     Returns:
         The folders of the sequences.
@@ -60,7 +60,7 @@ def _write_sequence(
     rng = np.random.default_rng(seed)
     old = sequence in OLD
     names = [f"Camera ({k})" for k in OLD_CAMERAS] if old else [f"Camera_B{k}" for k in NEW_CAMERAS]
-    stage = np.array([0.4, 0.1, -0.3])  # people stand beside the world's origin
+    stage = np.array([0.4, 0.1, -0.3])  # people stand away from the world's origin
     matrices, lenses, poses = _calibration(len(names), size, stage, rng)
     grids = [_distorting_grid(matrix, lens, size) for matrix, lens in zip(matrices, lenses, strict=True)]
     lights = Lights().draw(rng)
@@ -102,8 +102,7 @@ def _long_stem(sequence: str, camera: str, frame: int) -> str:
 def _calibration(
     count: int, size: int, stage: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K [n, 3, 3] with centres at integers, lens coefficients [n, 5],
-    world to camera [n, 4, 4] in metres."""
+    """K [n, 3, 3] with centres at integers, lens coefficients [n, 5], world to camera [n, 4, 4] in metres."""
     matrices, poses = np.zeros((count, 3, 3)), np.zeros((count, 4, 4))
     centers = capture.ring(count, 2.9, 1.2, rng) + stage
     for k in range(count):
@@ -120,7 +119,7 @@ def _calibration(
 def _write_body(
     folder: Path, number: int, vertices: np.ndarray, pose: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Write both fits of one frame, with as many vertices as SMPL has."""
+    """Write both fits of one frame, with SMPL's number of vertices."""
     chosen = vertices[chosen_vertices()]
     worse = chosen + rng.normal(0, 0.015, 3)
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
@@ -137,8 +136,7 @@ def _write_body(
 
 
 def _distorting_grid(matrix: np.ndarray, lens: np.ndarray, size: int) -> torch.Tensor:
-    """Where ``grid_sample`` reads each distorted pixel in the undistorted photograph
-    [1, h, w, 2]."""
+    """Grid [1, h, w, 2] for ``grid_sample``: positions of distorted pixels in the undistorted photograph."""
     rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     pixels = torch.stack((columns, rows), -1).reshape(1, -1, 2).double()
     places = undistort_points(
