@@ -1,24 +1,23 @@
-r"""All measurements of the first minutes on a GPU: one prepared script for rented ones.
+r"""All measurements of the first minutes on a GPU, as one prepared script for rented machines.
 
     python benchmarks/gpu.py --dry first second          # rehearse on the pretend device of the tests
     python benchmarks/gpu.py first                       # 420 s: predictions, steps, kernels, loader
     python benchmarks/gpu.py second                      # 240 s of training after at most 180 of preparation
     python benchmarks/gpu.py --seconds 570 step prediction loader training    # within ten minutes
-    python benchmarks/gpu.py --table runs/gpu            # the tables again, from the files alone
+    python benchmarks/gpu.py --table runs/gpu            # print the tables of earlier runs
 
-Each section is a process of its own with a time limit. Findings are lines of JSON in
-``<out>/<run>.jsonl`` as soon as they are known; a section that fails or takes too long is a
-row with its last lines, and the others go on. Sections that are named are one run, in their order,
-but that one which must wait for people lets the next one pass; ``--seconds`` ends it. Whether results that
-are replayed are those of eager calls, for other inputs than the captured ones, is a row with a
-verdict; a wrong one is printed last, and the exit status is 1. In the background gsplat is compiled (its
-kernels for up to 9 channels, for this GPU) and built-in people are rendered on all cores; they
-pause while a section measures what a busy host would spoil. Both lie in ``--work``, where the
-next call finds them.
+Each section is a process with a time limit. Results are appended to ``<out>/<run>.jsonl``
+immediately; a section that fails or exceeds its limit is a row with its last lines, and the others
+continue. Sections on the command line are one run, in their order, except that a section that must
+wait for people lets the next one pass; ``--seconds`` limits the run. Whether replayed results agree
+with eager calls, for other inputs than the captured ones, is a row with a verdict; wrong ones are
+printed last, and the exit status is 1. In the background, gsplat is compiled (its kernels for up to 9
+channels, for this GPU) and built-in people are rendered on all cores; they are paused during sections
+that a busy host would distort. Both are stored in ``--work``, where later calls reuse them.
 
-A compiled gsplat can travel along. On a machine with nvcc 13, and with the Python and the
-PyTorch of the one with the GPU (three minutes on two cores for one architecture and kernels for
-up to 9 channels):
+A compiled gsplat can be brought along. Build it on a machine with nvcc 13, and with the Python and
+PyTorch versions of the one with the GPU (three minutes on two cores for one architecture and kernels
+for up to 9 channels):
 
     TORCH_CUDA_ARCH_LIST="9.0" pip install --no-build-isolation --no-deps --no-binary gsplat \
         --target gsplat_built gsplat==1.5.3
@@ -53,14 +52,17 @@ from benchmarks.gpu_replay import WRONG
 from benchmarks.gpu_sections import SECTIONS
 
 GSPLAT, PEOPLE = "gsplat", "people"
-CHANNELS = 9  #: Kernels of gsplat for more channels are not compiled.
-LAST_LINES = 12  #: of a section that failed
+CHANNELS = 9  #: Largest number of channels of compiled kernels of gsplat
+LAST_LINES = 12  #: printed for a failed section
 
 
 @dataclass(frozen=True)
 class Plan:
-    """When a section runs: its limit in seconds, what it needs, whether the background pauses
-    meanwhile, and how long it waits for more people than the first."""
+    """Conditions of a section.
+
+    ``seconds``: its limit. ``needs``: background processes that must end first. ``quiet``: pause the
+    background meanwhile. ``patience``: seconds to wait for more people than the first ones.
+    """
 
     seconds: int
     needs: tuple[str, ...] = ()
@@ -68,7 +70,7 @@ class Plan:
     patience: int = 0
 
 
-#: The most valuable first; a section that must wait for its needs lets the next one pass.
+#: By importance; a section that must wait for its needs lets the next one pass.
 PLANS = {
     "machine": Plan(40),
     "step": Plan(100, (GSPLAT,), quiet=True),
@@ -87,7 +89,7 @@ RUNS = {
 
 
 class Background:
-    """A background process in its own session, whose output is kept in a file."""
+    """A background process in a separate session, whose output is kept in a file."""
 
     def __init__(self, command: list[str], environment: dict[str, str]):
         self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115
@@ -99,12 +101,12 @@ class Background:
         return self.process.poll() is None
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal to the process and its children, if it still runs."""
+        """Send a signal to the process and its children, if it is running."""
         if self.is_running():
             os.killpg(self.process.pid, number)
 
     def wait(self, seconds: float) -> bool:
-        """Whether it ended within ``seconds``; it is ended otherwise."""
+        """Wait up to ``seconds``; kill the process if it has not ended. Returns whether it ended in time."""
         try:
             self.process.wait(max(seconds, 0))
         except subprocess.TimeoutExpired:
@@ -128,7 +130,7 @@ class Session:
 
     def __init__(self, options: argparse.Namespace, rows: Rows, plans: dict[str, Plan], seconds: float):
         self.options, self.rows, self.plans = options, rows, plans
-        self.scale = math.inf if options.dry else 1  # a rehearsal takes as long as the processor needs
+        self.scale = math.inf if options.dry else 1  # a rehearsal has no limits
         self.started, self.end = time.monotonic(), time.monotonic() + self.scale * seconds
         self.environment = environment_of(options)
         needs = {need for plan in plans.values() for need in plan.needs}
@@ -160,7 +162,7 @@ class Session:
                 process.stop()
 
     def is_ready(self, plan: Plan) -> bool:
-        """Whether what a section needs is there, or will never be."""
+        """Whether the needs of a section are met, or never will be."""
         if GSPLAT in plan.needs and self.background[GSPLAT].is_running():
             return False
         if PEOPLE not in plan.needs or not self.background[PEOPLE].is_running():
@@ -169,11 +171,11 @@ class Session:
         return is_first_there and time.monotonic() - self.started >= plan.patience
 
     def measure(self, name: str, plan: Plan) -> None:
-        """Run a section; note how it ended."""
+        """Run a section and add a row with its status."""
         for need in plan.needs:
             process = self.background[need]
             if need == PEOPLE and plan.patience:
-                process.stop()  # its cores are wanted
+                process.stop()  # frees its cores
             elif not process.is_running() and process.process.returncode:
                 self.note(name, f"{need} failed", 0.0, process.last_lines())
                 return
@@ -183,7 +185,7 @@ class Session:
         section = Background(self.command(name), self.environment)
         try:
             in_time = section.wait(min(self.scale * plan.seconds, self.end - begun))
-        finally:  # also where the whole command is ended
+        finally:  # also when the whole command is terminated
             section.stop()
         status = "done" if section.process.returncode == 0 else "failed" if in_time else "took too long"
         self.note(name, status, time.monotonic() - begun, [] if status == "done" else section.last_lines())
@@ -195,12 +197,12 @@ class Session:
         print(f"{time.monotonic() - self.started:6.0f} s  {section}: {status}", *last_lines[-1:], flush=True)
 
 
-#: Compiles gsplat by importing it.
+#: Importing gsplat compiles it.
 BUILD = "from gsplat.cuda._backend import _C; assert _C is not None, 'gsplat found no CUDA compiler'"
 
 
 def environment_of(options: argparse.Namespace) -> dict[str, str]:
-    """Variables of all processes: where gsplat, its build and the people are."""
+    """Environment variables of all processes: paths of gsplat, its build and the people."""
     root = str(Path(__file__).resolve().parents[1])
     paths = [root, *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     if options.gsplat is not None:
@@ -213,8 +215,7 @@ def environment_of(options: argparse.Namespace) -> dict[str, str]:
 
 
 def fewer_channels(package: Path, folder: Path) -> Path:
-    """A copy of gsplat in ``folder`` whose kernels for many channels are left out:
-    a third of the time."""
+    """Copy gsplat to ``folder`` without its kernels for many channels, to compile in a third of the time."""
     if not folder.exists():
         shutil.copytree(package, folder / package.name)
         for file in folder.glob("*/cuda/csrc/*.c*"):
@@ -224,7 +225,7 @@ def fewer_channels(package: Path, folder: Path) -> Path:
 
 
 def is_for_many_channels(line: str) -> bool:
-    """Whether a line of gsplat's sources makes or starts a kernel that is left out."""
+    """Whether a line of gsplat's sources instantiates or launches an excluded kernel."""
     found = re.fullmatch(r"\s*__(?:INS|LAUNCH_KERNEL)__\((\d+)\)", line)
     return found is not None and int(found[1]) > CHANNELS
 
@@ -249,15 +250,14 @@ def shown(value: Any) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Rows as Markdown, with a column for each of their numbers."""
+    """Format rows as Markdown, with a column for each of their numbers."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     return lines + [f"| {' | '.join(shown(row.get(column, '')) for column in columns)} |" for row in rows]
 
 
 def report(found: list[dict[str, Any]]) -> str:
-    """Tables of all sections, and the kernels that take most of the time of each row
-    that has them."""
+    """Tables of all sections, and the longest kernels of each row that has them."""
     lines, hidden = [], ("section", "status", "last_lines", "longest", "numbers")
     for name, section in SECTIONS.items():
         own = [row for row in found if row["section"] == name]
@@ -299,7 +299,7 @@ def arguments() -> argparse.Namespace:
 
 
 def runs_of(names: list[str]) -> dict[str, tuple[list[str], float]]:
-    """Sections and seconds of runs by their names; sections that are named are one run."""
+    """Sections and seconds of runs by name; sections on the command line are one run."""
     runs = {name: RUNS[name] for name in names if name in RUNS}
     sections = [name for name in names if name in PLANS]
     if sections:

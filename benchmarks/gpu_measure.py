@@ -1,5 +1,8 @@
-"""How long a GPU is busy, with what, and what it is waited for; a rehearsal of that without a GPU; what a
-section of ``benchmarks/gpu.py`` is called with: its machine, its sizes, the file of findings."""
+"""Measurement for ``benchmarks/gpu.py``: times, launches and synchronisations of a GPU.
+
+Also a rehearsal without a GPU, and the arguments of a section: device, sizes, and the file of
+results.
+"""
 
 import contextlib
 import itertools
@@ -31,25 +34,25 @@ from ghgs_lit.types import Batch
 from tests.helpers.capture_backends import OperatorBackend
 from tests.helpers.pretend_device import DEVICE, pretend_device
 
-#: Kinds of a trace's events that are work of a GPU; in a rehearsal, operators.
+#: Categories of trace events that count as GPU work; in a rehearsal, operators.
 WORK, REHEARSED_WORK = ("kernel", "gpu_memcpy", "gpu_memset"), ("cpu_op",)
-LONGEST = 40  #: Kernels that are listed
+LONGEST = 40  #: number of listed kernels
 
 
 class Gpu:
-    """A GPU that is measured; ``is_real``: not the pretend device of a rehearsal."""
+    """A measured GPU; ``is_real``: not the pretend device of a rehearsal."""
 
     def __init__(self, device: torch.device, is_real: bool):
         self.device, self.is_real = device, is_real
 
     def backend(self) -> CaptureBackend:
-        """Captures calls: CUDA graphs; in a rehearsal a stand-in that repeats operators."""
+        """Capture backend: CUDA graphs; in a rehearsal, a stand-in that repeats operators."""
         return CudaGraphs() if self.is_real else OperatorBackend(self.device.type)
 
     def milliseconds(self, call: Callable[[], Any], repeats: int) -> float:
-        """Median time of a call, by events; the host submits as fast as it can."""
+        """Median time of a call between events; it includes idle time if the host submits too slowly."""
         for _ in range(min(repeats, 3)):
-            call()  # compiles, fills caches
+            call()  # compilation and caches
         spans = []
         for _ in range(repeats):
             begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -62,7 +65,7 @@ class Gpu:
         return statistics.median(spans)
 
     def milliseconds_of_each(self, calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
-        """Median times of calls that follow one another, by events between them."""
+        """Median times of consecutive calls, by events between them."""
         spans: list[list[float]] = [[] for _ in calls]
         for _ in range(repeats):
             marks = [torch.cuda.Event(enable_timing=True) for _ in range(len(calls) + 1)]
@@ -77,8 +80,13 @@ class Gpu:
         return [statistics.median(span) for span in spans]
 
     def work(self, call: Callable[[], Any], repeats: int = 3) -> dict[str, Any]:
-        """Of a call, means: ``busy_ms`` of the GPU, ``launches``, ``waits`` of the host, and
-        ``longest``, the kernels that take most of the time: name, calls, milliseconds."""
+        """Profile a call.
+
+        Returns:
+            Means over ``repeats``: ``busy_ms`` of the GPU, ``launches``, ``waits`` (synchronisations
+            of the host), and ``longest``, the kernels with the largest total times: name, calls,
+            milliseconds.
+        """
         torch.cuda.synchronize()
         with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as found:
             for _ in range(repeats):
@@ -96,7 +104,7 @@ class Gpu:
         return {
             "busy_ms": sum(times.values()),
             "launches": calls.total() / repeats,
-            "waits": max(waits - 1, 0) / repeats,  # the last one is this function's
+            "waits": max(waits - 1, 0) / repeats,  # the last one is of this function
             "longest": longest,
         }
 
@@ -109,7 +117,7 @@ def _events(found: profile) -> list[dict]:
 
 
 def reason(error: BaseException) -> str:
-    """An error in one line, with the innermost line of the package that led to it."""
+    """Format an error in one line, with the innermost line of the package in its traceback."""
     lines = [f for f in traceback.extract_tb(error.__traceback__) if "ghgs_lit" in f.filename]
     place = f" ({Path(lines[-1].filename).name}:{lines[-1].lineno})" if lines else ""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}{place}"
@@ -117,8 +125,7 @@ def reason(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def rehearsal() -> Iterator[Gpu]:
-    """The pretend device of the tests as a GPU,
-    with stand-ins for what PyTorch has for CUDA alone."""
+    """The pretend device of the tests as a GPU, with stand-ins for CUDA-only parts of PyTorch."""
     with pretend_device(), drawing_nothing(), contextlib.ExitStack() as stack:
         for name, value in _stand_ins().items():
             stack.enter_context(mock.patch.object(torch.cuda, name, value))
@@ -127,7 +134,7 @@ def rehearsal() -> Iterator[Gpu]:
         on_cuda = partial(precision.precision_of, device=torch.device("cuda"))  # tf32, too
         for module in (predictor, step):
             stack.enter_context(mock.patch.object(module, "precision_of", lambda name, _: on_cuda(name)))
-        without = partial(torch.autocast, enabled=False)  # it has no half precision
+        without = partial(torch.autocast, enabled=False)  # the CPU stand-in has no half precision
         stack.enter_context(mock.patch.object(torch, "autocast", lambda device, *_, **__: without(device)))
         yield Gpu(DEVICE, is_real=False)
 
@@ -157,7 +164,7 @@ def _stand_ins() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Sizes:
-    """What is measured, and how often."""
+    """Sizes and repetitions of the measurements."""
 
     side: int = 252
     large: int = 518
@@ -171,10 +178,10 @@ class Sizes:
     product: int = 8192  #: rows and columns
     vertices: int = 10475
     workers: tuple[int, ...] = (4, 8, 15)
-    seconds: float = 8.0  #: of a measurement of the loader
+    seconds: float = 8.0  #: per measurement of the loader
     people: tuple[tuple[int, int, int], ...] = (
         *((16, 8, 4), (48, 24, 16), (96, 48, 16), (144, 72, 16), (200, 100, 16)),
-    )  #: training people, active ones, validation people: each is a step further
+    )  #: training people, active ones, validation people, rendered step by step
     training: tuple[str, ...] = ("trainer.max_time=00:00:03:00", "trainer.val_check_interval=25")
 
 
@@ -186,7 +193,7 @@ DRY = Sizes(
     encoder="vggt_nano",
     shipped=(
         *("data.size=28", "data.render.samples=1", "encoder.width=48", "augmentation=none"),
-        "rounds.height=null",  # smaller copies would keep steps from being captured
+        "rounds.height=null",  # downsampled views would prevent the capture of steps
     ),
     repeats=1,
     copied=2**10,
@@ -200,26 +207,25 @@ DRY = Sizes(
 
 
 class Rows:
-    """A file of findings, a line of JSON each,
-    which holds whatever was found before a process ended."""
+    """A file of results, a line of JSON each, which keeps earlier results if the process is killed."""
 
     def __init__(self, file: Path):
         self.file = file
 
     def add(self, **values: Any) -> None:
-        """Write a line at once."""
+        """Append a line immediately."""
         with self.file.open("a") as lines:
             lines.write(json.dumps(values) + "\n")
 
     def read(self) -> list[dict[str, Any]]:
-        """All lines so far."""
+        """Read all lines so far."""
         lines = self.file.read_text().splitlines() if self.file.exists() else []
         return [json.loads(line) for line in lines]
 
 
 @dataclass(frozen=True)
 class Call:
-    """What a section is called with."""
+    """Arguments of a section."""
 
     gpu: Gpu
     rows: "Rows"
@@ -229,12 +235,12 @@ class Call:
     overrides: list[str] = field(default_factory=list)
 
     def add(self, row: str, **numbers: Any) -> None:
-        """Write a row at once."""
+        """Append a row immediately."""
         self.rows.add(section=self.section, row=row, **numbers)
 
     @property
     def rendered(self) -> list[int]:
-        """Numbers of the people that are there: in training, active ones, in validation."""
+        """Numbers of rendered people: in training, active ones, in validation."""
         return [row["numbers"] for row in self.rows.read() if "numbers" in row][-1]
 
     def run(self, *overrides: str) -> Run:
@@ -242,11 +248,11 @@ class Call:
 
     @property
     def shipped(self) -> list[str]:
-        """Overrides of the training of the weights that come with the package."""
+        """Overrides of the training of the shipped weights."""
         return ["experiment=shipped", *self.sizes.shipped]
 
     def batch(self, size: int, side: int) -> Batch:
-        """``size`` subjects on 15 % of the frame, on the CPU, with depths and bodies."""
+        """``size`` subjects that cover 15 % of the frame, on the CPU, with depths and bodies."""
         batch = ellipsoid_batch(0.15, self.sizes.views, side, size)
         vertices = [torch.rand(self.sizes.vertices, 3) for _ in range(size)]
         batch = replace(batch, depths=2.0 * batch.masks, body_vertices=vertices)

@@ -1,4 +1,4 @@
-"""What ``benchmarks/gpu.py`` measures: functions of a :class:`Call`; docstrings are titles of tables."""
+"""Sections of ``benchmarks/gpu.py``: functions of a :class:`Call`, whose docstrings are titles of tables."""
 
 import gc
 from collections.abc import Callable, Sequence
@@ -28,12 +28,12 @@ from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch, map_tensors
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Attention of PyTorch but cuDNN's, the fastest first.
+#: PyTorch's attention backends except cuDNN's, the fastest first.
 ATTENTION = (SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH)
 
 
 def machine(call: Call) -> None:
-    """The machine, and what it can do at best"""
+    """The machine and its peak rates"""
     gpu, sizes = call.gpu, call.sizes
     facts = machine_facts(gpu.device if gpu.is_real else torch.device("cpu"))
     call.add("versions", **{name: str(value) for name, value in facts.items()})
@@ -50,7 +50,7 @@ def machine(call: Call) -> None:
 
 
 def _built(call: Call, run: Run) -> GHGS:
-    """A model with fresh weights, made on the device."""
+    """A model with fresh weights, created on the device."""
     with call.gpu.device:
         return GHGS.from_config(run.plain).to(call.gpu.device)
 
@@ -58,7 +58,7 @@ def _built(call: Call, run: Run) -> GHGS:
 def _predicted(
     call: Call, name: str, predictor: Predictor, batch: Batch, precisions: Sequence[str] = PRECISIONS
 ) -> None:
-    """Rows of a prediction in each precision."""
+    """Add rows of a prediction in each precision."""
     for precision in precisions:
         predictor.precision = precision
         with torch.no_grad():
@@ -66,7 +66,7 @@ def _predicted(
             ms = call.gpu.milliseconds(run, call.sizes.repeats)
             work = call.gpu.work(run)
             stages = {}
-            if predictor.options.capture == "off":  # a probe keeps stages from being captured
+            if predictor.options.capture == "off":  # a probe prevents the capture of stages
                 probe = SecondsProbe(call.gpu.device)
                 with watched(predictor.model, probe), inside(TOTAL, probe):
                     run()
@@ -76,7 +76,7 @@ def _predicted(
 
 
 def prediction(call: Call) -> None:
-    """A prediction of the weights that come with the package, eager and replayed"""
+    """A prediction of the shipped weights, eager and replayed"""
     predictor = _capturing(call, Predictor.from_checkpoint(map_location=call.gpu.device))
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
@@ -90,7 +90,7 @@ def prediction(call: Call) -> None:
 
 
 def _capturing(call: Call, predictor: Predictor) -> Predictor:
-    """The predictor with graphs of this device."""
+    """The predictor with a graph cache for this device."""
     predictor.graphs = GraphCache(backend=call.gpu.backend())
     return predictor
 
@@ -150,7 +150,7 @@ class _Step:
         self.optimizer.zero_grad()
 
     def called(self) -> Tensor:
-        """The loss, operator by operator; as in a training, all under autocast."""
+        """The loss, operator by operator; all under autocast, as in training."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             for part in (self.forward, self.render, self.loss):
                 part()
@@ -177,7 +177,7 @@ class _Step:
 
 
 def _stepped(call: Call, name: str, step: _Step) -> None:
-    """Rows of a step: as a whole, and of each part by itself."""
+    """Add rows of a step: as a whole, and for each part."""
     torch.cuda.reset_peak_memory_stats()
     ms = call.gpu.milliseconds(step, call.sizes.repeats)
     call.add(name, ms=ms, peak_gb=torch.cuda.max_memory_allocated() / 1e9, **call.gpu.work(step, 2))
@@ -187,7 +187,7 @@ def _stepped(call: Call, name: str, step: _Step) -> None:
 
 
 def _captured(call: Call, name: str, step: _Step) -> None:
-    """Rows of a replayed step: how long it takes, and whether it is as eager."""
+    """Add rows of a replayed step: its time, and its agreement with eager calls."""
     ms = call.gpu.milliseconds(step.captured, call.sizes.repeats)
     cache = step.captured_step.graphs
     work = call.gpu.work(step.captured, 2)
@@ -197,7 +197,7 @@ def _captured(call: Call, name: str, step: _Step) -> None:
 
 
 def step(call: Call) -> None:
-    """A training step of experiment=shipped on a batch that is ready, two rounds; parts by themselves"""
+    """A training step of experiment=shipped on a prepared batch, two rounds; parts measured separately"""
     for size in reversed(call.sizes.batches):
         made = _Step(call, call.run(*call.shipped), call.batch(size, call.sizes.side))
         with precision_of("tf32", torch.device("cuda")):  # as trainer=gpu
@@ -225,7 +225,7 @@ def frozen(call: Call) -> None:
 
 
 class _Calls(TorchDispatchMode):
-    """The first inputs of each operator of the package."""
+    """Collects the first inputs of each operator of the package."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -238,13 +238,13 @@ class _Calls(TorchDispatchMode):
 
 
 def kernels(call: Call) -> None:
-    """Kernels in Triton, the same eager and compiled, with the rate of a copy; attention by backend"""
+    """Triton kernels, the same eager and compiled, with memory rates; attention by backend"""
     predictor = Predictor.from_checkpoint(map_location=call.gpu.device)
     batch = replace(call.batch(max(call.sizes.batches), call.sizes.side), targets=None).to(call.gpu.device)
     predictor.precision = "tf32"
     with _Calls() as calls:
         with torch.no_grad():
-            predictor(batch)  # one kernel is of predictions alone
+            predictor(batch)  # one kernel runs only without gradients
         predictor(batch).gaussians.means.sum().backward()
     with_kernels = {name for name, operator in OPERATORS.items() if "cuda" in operator.kernels}
     for name in with_kernels - set(calls.inputs):
@@ -255,14 +255,14 @@ def kernels(call: Call) -> None:
         for kind, run in {"kernel": function, "eager": OPERATORS[name].plain}.items():
             _chain(call, name, kind, partial(run, *inputs), moved[name])
     _attention(call)
-    for name, (_, inputs) in calls.inputs.items():  # takes longest
+    for name, (_, inputs) in calls.inputs.items():  # the slowest part
         compiled = torch.compile(OPERATORS[name].plain, dynamic=False)
         _chain(call, name, "compiled", partial(compiled, *inputs), moved[name])
 
 
 @torch.no_grad()
 def _chain(call: Call, name: str, kind: str, run: Callable[[], Any], moved: int) -> None:
-    """Row of a chain, whose rate is by the bytes that it must read and write at least."""
+    """Add a row of an operator; its rate is by the bytes of its inputs and outputs."""
     try:
         ms, work = call.gpu.milliseconds(run, call.sizes.repeats), call.gpu.work(run)
         call.add(f"{name}, {kind}", ms=ms, gb_s=moved / max(work["busy_ms"], 1e-6) / 1e6, **work)
@@ -283,7 +283,7 @@ def _bytes(value: Any) -> int:
 
 @torch.no_grad()
 def _attention(call: Call) -> None:
-    """Rows of the global attention of ``vggt_1b`` in bfloat16."""
+    """Add rows of the global attention of ``vggt_1b`` in bfloat16."""
     tokens = call.sizes.views * ((call.sizes.large // 14) ** 2 + 5)
     q, k, v = torch.rand(3, 1, 16, tokens, 64, device=call.gpu.device, dtype=torch.bfloat16)
     for backend in (SDPBackend.FLASH_ATTENTION, SDPBackend.CUDNN_ATTENTION, SDPBackend.EFFICIENT_ATTENTION):

@@ -1,7 +1,7 @@
 """Measure the CPU rasterizer: ``python benchmarks/rasterizer.py``.
 
-The scene is a closed body of flat splats that covers 19 % of a frame of 512 x 512; the sigma of a splat is
-about the distance to the next one. Prints minima over interleaved runs.
+The scene is a closed surface of flat splats that covers 19 % of a frame of 512 x 512 pixels; the
+sigma of a splat is about its distance to the next one. Prints minima over interleaved runs.
 """
 
 import math
@@ -25,7 +25,7 @@ REPEATS = 12
 
 
 def scene(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
-    """Splats that require gradients on an ellipsoid, and one camera."""
+    """Splats on an ellipsoid that require gradients, and one camera."""
     generator = torch.Generator().manual_seed(seed)
     normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     focal, distance = 1.4 * size, 3.0
@@ -68,7 +68,7 @@ def main() -> None:
     upstream = torch.randn(3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
     for count in COUNTS:
         gaussians, cameras = scene(count, SIZE)
-        seconds(gaussians, cameras, upstream)  # compiles
+        seconds(gaussians, cameras, upstream)  # compilation
         times: dict[int, list[tuple[float, float]]] = {threads: [] for threads in THREADS}
         for _ in range(REPEATS):
             for threads, found in times.items():

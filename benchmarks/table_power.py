@@ -1,12 +1,12 @@
-"""Power and false stars of ``ghgs table`` in randomly sampled tables.
+"""Power and false positives of ``ghgs table`` in randomly sampled tables.
 
     python benchmarks/table_power.py [number of tables]
 
-A value is the sum of its row's mean, a chance of its seed and of its subject that rows share, and a
-chance of the row's own with each seed (``deviations``), each subject and both. ``pairs``: each pair
-of rows alone, corrected over three metrics as if all were tested; ``pooled``: as ``ghgs table``
-does; ``plain``: the same without room for a reference that varies more than others. False stars are
-counted where seeds decide, which is the worst for a pooled variance.
+A value is the sum of its row's mean, random effects of its seed and its subject that rows share, and
+interactions of the row with each seed (``deviations``), each subject and both. ``pairs``: each pair
+of rows alone, corrected over three metrics as if all were tested; ``pooled``: as in ``ghgs table``;
+``plain``: the same without the allowance for a reference that varies more than others. False stars
+are counted where seeds dominate, which is the worst case for a pooled variance.
 """
 
 import sys
@@ -22,23 +22,23 @@ from ghgs_lit.evaluation.tables.significance import compare, holm, pool, smalles
 ALPHA = 0.05
 SUBJECTS = 20
 DEVIATION = 0.1
-"""Of a row over seeds, dB; for power, also of its interactions with subjects and of the rest."""
+"""Deviation of a row over seeds, dB; for power, also of its interactions with subjects and of the rest."""
 WAYS = ("pairs", "plain", "pooled")
 PAPER = (0.0, -0.35, -0.74, -1.09)
 """The paper's differences from the whole method, and their sum for the row with neither, dB."""
 ALONE = (0.0, -0.35, 0.0, 0.0)
-"""The smallest of them, without larger ones that Holm's correction takes before it."""
+"""The smallest of them, without larger ones that precede it in Holm's correction."""
 
 
 def draw(
     rng: np.random.Generator, means: Sequence[float], deviations: Sequence[float], seeds: int, people: float
 ) -> list[pd.DataFrame]:
-    """Rows of a table: values by seed and subject.
+    """Sample the rows of a table: values by seed and subject.
 
     Args:
-        rng: Source of all that is drawn.
-        means: Of the rows, dB.
-        deviations: Of the rows over seeds, dB.
+        rng: Source of all samples.
+        means: Means of the rows, dB.
+        deviations: Deviations of the rows over seeds, dB.
         seeds: Number of seeds.
         people: Deviation of a row over subjects and of the rest, dB.
     """
@@ -53,8 +53,7 @@ def draw(
 
 
 def marked(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float]:
-    """Whether each row but the first is marked against it,
-    and the mean of the smallest differences."""
+    """Whether each row but the first is marked against it, and the mean of the smallest differences."""
     shared = None if way == "pairs" else pool(rows)
     if way == "plain":
         shared = replace(shared, rows=2)
@@ -74,17 +73,19 @@ def tables(
     people: float = DEVIATION,
     start: int = 0,
 ) -> tuple[np.ndarray, float]:
-    """Marks of ``trials`` tables [trials, rows - 1],
-    and the root mean square of their smallest differences.
+    """Sample and test tables.
 
     Args:
-        means: Of the rows, dB; the first is the reference.
+        means: Means of the rows, dB; the first is the reference.
         ratios: Deviations of the rows over seeds, in multiples of ``DEVIATION``.
         seeds: Number of seeds.
         way: One of ``WAYS``.
         trials: Number of tables.
         people: Deviation of a row over subjects and of the rest, dB.
-        start: Seed of the draws.
+        start: Seed of the random numbers.
+
+    Returns:
+        Marks [trials, rows - 1], and the root mean square of the smallest differences, dB.
     """
     rng = np.random.default_rng(start)
     deviations = [DEVIATION * ratio for ratio in ratios]
@@ -95,8 +96,7 @@ def tables(
 
 
 def main(trials: int = 100) -> None:
-    """Print tables with a star without a difference, stars by difference,
-    and the smallest difference."""
+    """Print the shares of tables with false stars, the power by difference, and the smallest difference."""
     started = time.perf_counter()
     print(f"| tables with a false star | rows | seeds | {' | '.join(WAYS)} |\n|{'---|' * 6}")
     for name, ratios in (("alike", (1,)), ("reference twice", (2, 1)), ("reference and another", (2, 2, 1))):
