@@ -80,7 +80,7 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     assert "ablation: full*" in out
     assert "encoder: vggt_1b | vggt_nano* | vggt_small" in out
     assert "| my_people" in out
-    assert "seed (default 1; an integer >= 0 and <= 4294967295)\n    Of weights" in out
+    assert "seed (default 1; an integer >= 0 and <= 4294967295)\n    Seed of the weights" in out
     code, out, _ = call(monkeypatch, capsys, "train", "model=hull", "--help", "depth_head")
     assert code == 0
     assert "== depth_head: {kind: dpt, ...} ==" in out
