@@ -1,1 +1,1 @@
-"""The paper: one module or package a stage, and :mod:`ghgs_lit.method.model`."""
+"""The paper's method: one module or package per stage, and the model (:mod:`ghgs_lit.method.model`)."""

@@ -36,8 +36,8 @@ class GHGS(nn.Module):
         unprojection: depths to points in the world.
         recalibration: tokens to tokens, by attention among neighbouring points.
         gaussian_head: tokens and points to Gaussians.
-        rounds: refine the Gaussians of the Gaussian head and require bounds; None: no rounds.
-        skip: work to leave out; None: ``skip=exact``.
+        rounds: refinement of the head's Gaussians, which requires bounds; None: no rounds.
+        skip: preset of work to leave out; None: ``skip=exact``.
 
     Raises:
         InputError: a stage requires bounds, which are None, or vice versa.
@@ -64,17 +64,17 @@ class GHGS(nn.Module):
         self.gaussian_head = gaussian_head
         self.rounds = NoRounds() if rounds is None else rounds
         self.skip = skip or SkipOptions()
-        #: The nodes that :meth:`from_config` built the model from; empty if the stages were given.
+        #: Nodes that :meth:`from_config` built the model from; empty if it was built otherwise.
         self.config: dict[str, Any] = {}
-        #: Whether predictions outside of training contain the Gaussians before each round.
+        #: Whether predictions, except in training, contain the Gaussians before each round.
         self.keeps_drafts = False
 
     def forward(self, batch: Batch, plan: Plan | None = None, coarse: Coarse | None = None) -> Prediction:
-        """Gaussians, depths and points in the world of the batch's cameras.
+        """Predict Gaussians, depths and points in the world of the batch's cameras.
 
         Args:
             batch: preprocessed: whole patches, in metres around the subject.
-            plan: of the batch; None: computed here.
+            plan: plan of the batch; None: computed here.
             coarse: tokens and depths predicted from downsampled views; None: full resolution only.
 
         Returns:
@@ -95,12 +95,12 @@ class GHGS(nn.Module):
         return prediction_of(states, self.keeps_drafts and not self.training, encoded)
 
     def _for_heads(self, tokens: Tokens) -> Tokens:
-        """Tokens in the precision of the heads, which may differ from that of the encoder."""
+        """Convert tokens to the dtype of the heads, which may differ from that of the encoder."""
         parameters = itertools.chain.from_iterable(getattr(self, name).parameters() for name in HEADS)
         return tokens.in_precision(next(parameters, tokens.semantic).dtype)
 
     def measure(self, batch: Batch, flags: Sequence[Bool[Tensor, ""]] = ()) -> MaskStatistics:
-        """Mask statistics from which :meth:`plan` is made, as tensors on the device of the masks.
+        """Compute the mask statistics for :meth:`plan`, as tensors on the device of the masks.
 
         Args:
             batch: preprocessed.
@@ -110,14 +110,14 @@ class GHGS(nn.Module):
         return MaskStatistics.of(batch.masks, self.encoder.patch_size, self.encoder.keeps(batch.masks), flags)
 
     def plan(self, batch: Batch, measured: MaskStatistics | None = None, least: Sizes | None = None) -> Plan:
-        """Patches, tokens and pixels that the stages compute.
+        """Plan the patches, tokens and pixels that the stages compute.
 
         This is the only device-to-host synchronisation before the stages.
 
         Args:
             batch: preprocessed.
             measured: result of :meth:`measure`; None: computed here.
-            least: sizes of a shape bucket, reused while they suffice; None: sizes of the scene.
+            least: sizes of a shape bucket, reused if they suffice; None: sizes of the scene.
         """
         targets = [] if batch.targets is None else [batch.targets.cameras]
         plan = make_plan(
@@ -136,13 +136,13 @@ class GHGS(nn.Module):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: bool = False) -> "GHGS":
-        """Builds the model of a configuration.
+        """Build the model of a configuration.
 
         Args:
-            config: nodes by name: all of :data:`ghgs_lit.method.stages.STAGES`,
-                and any of ``OPTIONS`` in the same module.
-            empty: build on the meta device, for weights that are loaded afterwards: a wrong configuration
-                then allocates no memory before it is compared with them.
+            config: nodes by name: all of :data:`ghgs_lit.method.stages.STAGES`, and any of
+                :data:`ghgs_lit.method.stages.OPTIONS`.
+            empty: build on the meta device, for weights that are loaded afterwards: if these do not fit,
+                no memory has been allocated.
 
         Raises:
             InputError: a stage is missing, an option is unknown or out of range, or stages are
@@ -174,19 +174,15 @@ class GHGS(nn.Module):
 
 
 def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
-    """Nodes of a model in which ``rounds.height: auto`` is replaced by a number of pixels.
+    """Replace ``rounds.height: auto`` in a model's nodes by a number of pixels; null if sizes are unknown.
 
     Args:
-        nodes: of the model, by name, with or without rounds.
-        trained: configuration of its training, of which ``data.size`` and ``augmentation.sizes``
-            are used.
-
-    Returns:
-        The nodes; without known sizes ``rounds.height`` is null.
+        nodes: nodes of the model by name, with or without rounds.
+        trained: configuration of its training: ``data.size`` and ``augmentation.sizes`` are used.
     """
     rounds = nodes.get("rounds")
     rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
-    # not a user-defined kind
+    # User-defined kinds of rounds are left as they are.
     is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"
     if not is_known or rounds.get("height", "auto") != "auto":
         return dict(nodes)

@@ -23,7 +23,7 @@ from ghgs_lit.types import (
     Tokens,
 )
 
-#: The nodes of a configuration that a model needs, in the order of the data flow.
+#: Nodes of a configuration that a model requires, in the order of the data flow.
 STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head")
 
 #: Stages with weights whose widths follow the encoder's.
@@ -37,7 +37,7 @@ class Bounds(Protocol):
     """Near and far of each pixel's ray; options: ``build()``.
 
     Attributes:
-        is_bounded: false if the stage returns None, which requires a depth head without bounds.
+        is_bounded: False if the stage returns None, which requires a depth head without bounds.
     """
 
     is_bounded: bool
@@ -49,7 +49,7 @@ class Bounds(Protocol):
             batch: masks and cameras are read; images may have any size.
 
         Returns:
-            Near and far [B, V, H, W] in metres; None where ``is_bounded`` is false.
+            Near and far [B, V, H, W] in metres; None if ``is_bounded`` is False.
         """
 
 
@@ -61,8 +61,7 @@ class Encoder(Protocol):
         dim_latent: width of a layer of the tokens.
         patch_size: side of a patch in pixels.
         bounds_input: whether bounds are an input.
-        tokens: which patches have tokens; can be set later, as can ``margin``,
-            and changes :meth:`keeps`.
+        tokens: which patches have tokens; mutable, like ``margin``, and affects :meth:`keeps`.
         margin: number of patches around these that also have tokens.
     """
 
@@ -84,8 +83,8 @@ class Encoder(Protocol):
         Args:
             images: in [0, 1]; sides are divisible by ``patch_size``.
             masks: the subject's pixels.
-            bounds: of all pixels, read where ``bounds_input``; None for stages without bounds.
-            plan: which patches become tokens.
+            bounds: bounds of all pixels, used if ``bounds_input``; None in models without bounds.
+            plan: selects the patches that become tokens.
         """
 
     def keeps(self, masks: Bool[Tensor, "B V H W"]) -> Bool[Tensor, "B V h w"]:
@@ -111,12 +110,11 @@ class DepthHead(Protocol):
         Args:
             tokens: of the encoder.
             batch: images, masks and cameras are read.
-            bounds: of all pixels; None where ``is_bounded`` is false.
-            plan: where depths are needed.
+            bounds: bounds of all pixels; None if ``is_bounded`` is False.
+            plan: selects the pixels that need depths.
 
         Returns:
-            Depths [B, V, H, W] in metres, between the bounds if any,
-            and a mask of valid pixels.
+            Depths [B, V, H, W] in metres, between the bounds if any, and a mask of valid pixels.
         """
 
 
@@ -128,7 +126,7 @@ class Unprojection(Protocol):
 
         Args:
             depth_maps: in metres.
-            tokens: of the encoder; their patches get points, too.
+            tokens: tokens of the encoder; their patches get points, too.
             batch: cameras are read.
         """
 
@@ -137,18 +135,18 @@ class Recalibration(Protocol):
     """Tokens to tokens; options: ``build(dim_latent)``.
 
     Attributes:
-        tokens: ``all``: background tokens are recalibrated, too, so that all pixels need a depth;
+        tokens: ``all``: background tokens are recalibrated, too, so that all pixels need depths;
             ``subject``: only tokens of the subject.
     """
 
     tokens: DecodedPixels
 
     def __call__(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
-        """The same tokens with recalibrated layers.
+        """Recalibrate the layers of tokens.
 
         Args:
-            tokens: of the encoder.
-            points: of pixels and tokens in the world, in metres.
+            tokens: tokens of the encoder.
+            points: points of pixels and tokens in the world, in metres.
             plan: tokens in ``peers`` with valid points are recalibrated.
         """
 
@@ -168,30 +166,24 @@ class GaussianHead(Protocol):
     def __call__(
         self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps, plan: Plan
     ) -> Any:
-        """Raw attributes of the valid pixels in ``plan.subject``.
+        """Predict raw attributes of the valid pixels in ``plan.subject``, the input of :meth:`activate`.
 
         Args:
-            tokens: recalibrated ones.
+            tokens: recalibrated tokens.
             batch: images, masks and cameras are read.
-            points: of pixels in the world, in metres.
+            points: points of pixels in the world, in metres.
             depth_maps: in metres.
-            plan: which pixels become Gaussians, and the windows to decode.
-
-        Returns:
-            The input of :meth:`activate`.
+            plan: selects the pixels that become Gaussians, and the windows to decode.
         """
 
     def activate(self, raw: Any, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """Gaussians from raw attributes.
+        """Convert raw attributes to Gaussians with the indices of their pixels.
 
         Args:
-            raw: result of the first step; rounds change it.
+            raw: result of the first step, possibly changed by rounds.
             batch: images, mattes and cameras are read.
-            points: of pixels in the world, in metres; rounds move them.
-            depth_maps: in metres, of these points.
-
-        Returns:
-            Gaussians with the indices of their pixels.
+            points: points of pixels in the world, in metres, possibly moved by rounds.
+            depth_maps: depths of these points, in metres.
         """
 
 
@@ -205,11 +197,7 @@ class Renderer(Protocol):
     """Gaussians to images; options: ``build()``."""
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Images of the Gaussians.
-
-        Args:
-            gaussians: of B elements, in the world of the cameras.
-            cameras: [B, T].
+        """Render Gaussians of B elements, in the world of the cameras [B, T].
 
         Returns:
             Images [B, T, C, h, w], with alpha and depth [B, T, 1, h, w].
@@ -228,29 +216,26 @@ class Loss(Protocol):
     def __call__(
         self, prediction: Prediction, rendering: Rendering, batch: Batch
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The value that training minimises, and its terms by name.
+        """Return the scalar that training minimises, and its terms by name.
 
         Args:
-            prediction: of the model.
-            rendering: of its Gaussians from the targets' cameras.
+            prediction: prediction of the model.
+            rendering: its Gaussians rendered from the targets' cameras.
             batch: images and targets, and bodies and depths if the data set has them.
-
-        Returns:
-            The value, a scalar, and each term.
         """
 
 
 def require_bounds(bounds: Bounds, encoder: Encoder, depth_head: DepthHead, rounds: Any) -> None:
-    """Rejects stages that require bounds in a model without them, and vice versa.
+    """Reject stages that require bounds in a model without them, and vice versa.
 
     Args:
-        bounds: stage of the bounds.
+        bounds: the bounds stage.
         encoder: may take bounds as an input.
         depth_head: predicts depths with or without bounds.
         rounds: require bounds; None: no rounds.
 
     Raises:
-        InputError: with the name of the incompatible option.
+        InputError: stages are incompatible; the message names the option.
     """
     head = f"a depth head {'between' if depth_head.is_bounded else 'without'} bounds"
     expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"

@@ -1,6 +1,7 @@
-"""Agreement of the masks: a view whose mask contradicts all others does not vote. In silhouettes of
-one subject, each ray has a point that all the other silhouettes cover (silhouette coherence;
-Hernandez et al., PAMI 2007). Nothing here has a gradient."""
+"""Agreement of masks: a view whose mask contradicts all others does not vote.
+
+In consistent silhouettes of one subject, each ray has a point that all other silhouettes cover
+(silhouette coherence; Hernandez et al., PAMI 2007). Nothing here has a gradient."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,39 +22,36 @@ from ghgs_lit.ops.ray_marching import NEAREST, look_up
 RESOLUTION = 32
 _SAMPLES = 24
 
-#: Masks agree if the others explain at least this share of the rays of each.
+#: Masks agree if, for each mask, the others explain at least this fraction of its rays.
 _SHARE = 0.95
 
 
 def trusted_views(
     coarse: Silhouettes, center: Float[Tensor, "B 3"], reach: Float[Tensor, " B"], tolerance: int
 ) -> Bool[Tensor, "B V"]:
-    """Views that vote about the hull: those that show the subject,
-    except one that contradicts the others.
+    """Select the views that vote about the hull: those that show the subject, except one that
+    contradicts the others.
 
-    A mask that is cut leaves rays of the other views unexplained; a mask that is too large has
-    unexplained rays itself. If the masks do not agree (:data:`_SHARE`), the view without which
-    less than half of the unexplained share is left does not vote. With two views both vote: either
-    could be wrong.
+    A mask that misses parts leaves rays of the other views unexplained; a mask that is too large has
+    unexplained rays itself. If the masks do not agree (:data:`_SHARE`), the view without which the
+    unexplained fraction more than halves does not vote. With two views both vote: either could be
+    wrong.
 
     Args:
         coarse: masks of at most :data:`RESOLUTION` cells along the longer side, and their cameras.
-        center: of the subject in the world, in metres.
-        reach: a generous radius of the subject about ``center``, in metres.
+        center: centre of the subject in the world, in metres.
+        reach: generous radius of the subject about ``center``, in metres.
         tolerance: number of views in which a kept point may lie outside the mask.
-
-    Returns:
-        Which views vote.
     """
     masks = coarse.masks
     voting = masks.flatten(2).any(-1)
     votes = _votes(coarse, voting, center, reach)
     count = votes.sum(2, keepdim=True)
-    # Votes of all views, then without each single one.
+    # Votes of all views, then of all but each one.
     counts = torch.cat((count, count - votes), 2)
     hit = (counts <= tolerance).any(-1) & masks[:, :, None]
     explained = hit.flatten(3).sum(-1) / masks.flatten(2).sum(-1).clamp(min=1)[..., None]
-    # A view that has no vote need not be explained.
+    # A view without a vote need not be explained.
     silent = constant(torch.eye, masks.shape[1] + 1, like=masks)[1:] | ~voting[..., None]
     agreement = torch.where(silent, 1.0, explained).amin(1)
     best, suspect = agreement[:, 1:].max(1, keepdim=True)
@@ -63,22 +61,12 @@ def trusted_views(
 
 
 def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
-    """Outside-the-mask votes of each view for points on the rays of all views.
-
-    Args:
-        coarse: masks and their cameras.
-        voting: [B, V], views whose masks are used.
-        center: [B, 3], middle of the tested depths, in metres.
-        reach: [B], half of their range, in metres.
-
-    Returns:
-        Votes [B, v, o, h, w, S]: 1 where a point on a ray of view ``v`` projects outside
-        the mask of view ``o``.
-    """
+    """Votes [B, v, o, h, w, S] about points on the rays of all views: 1 where a point on a ray of view
+    ``v`` projects outside the mask of view ``o``; depths are sampled within ``reach`` of ``center``."""
     masks = coarse.masks
     cameras = coarse.cameras
     b, v = voting.shape
-    # At least one cell: the rays of a cell's pixels run next to the ray of its centre.
+    # At least one cell: the rays of a cell's pixels differ from the ray of its centre.
     outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting, coarse.cut)
     matrices = projection_matrices(cameras)
     middle = in_cameras(center, cameras.extrinsics)[..., 2]

@@ -1,6 +1,7 @@
-"""Near and far of each pixel from an axis-aligned box around the subject. The box is found
-by carving a coarse grid with the masks, dilated because real masks are noisy. Nothing here
-has a gradient."""
+"""Near and far of each pixel from an axis-aligned box around the subject.
+
+The box is found by carving a coarse grid with the masks, which are dilated because real masks are
+noisy. Nothing here has a gradient."""
 
 from typing import ClassVar
 
@@ -29,8 +30,7 @@ from ghgs_lit.method.bounds.rays import (
 from ghgs_lit.ops.ray_marching import NEAREST, look_up
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
-#: Cells along the longer side of the masks that are searched,
-#: and along each side of the grid that is carved.
+#: Largest number of cells along the longer side of the masks, and along each side of the carved grid.
 RESOLUTION = 160
 CELLS = 32
 
@@ -39,14 +39,15 @@ MARGIN = 0.03
 MIN_DEPTH = 0.1
 MIN_THICKNESS = 0.02
 
-#: The largest bound in metres, against overflow with cameras of absurd sizes.
+#: Largest bound in metres, against overflow with cameras of implausible scale.
 _FARTHEST = 1e6
 
 
 class SubjectBox(Options):
-    """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box. A ray
-    that misses the box gets the range of depths of the whole box. Views with an empty mask do not
-    vote, nor does one whose mask contradicts all others
+    """``bounds(batch) -> DepthBounds``: depths at which each ray enters and leaves the subject's box.
+
+    A ray that misses the box gets the range of depths of the whole box. Views with an empty mask do
+    not vote, nor does one whose mask contradicts all others
     (:func:`ghgs_lit.method.bounds.agreement.trusted_views`)."""
 
     group = "bounds"
@@ -62,13 +63,13 @@ class SubjectBox(Options):
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> DepthBounds:
-        """Bounds of all pixels, without a gradient.
+        """Compute bounds of all pixels, without a gradient.
 
         Args:
             batch: masks and cameras are read; images may have any size.
 
         Returns:
-            Near and far [B, V, H, W] in metres: near is :data:`MIN_DEPTH` or more, far at least
+            Near and far [B, V, H, W] in metres: near is at least :data:`MIN_DEPTH`, far at least
             :data:`MIN_THICKNESS` behind it.
         """
         with exact(batch.masks.device.type):
@@ -84,7 +85,7 @@ class SubjectBox(Options):
             return self._within(batch, coarse, voting, lower - MARGIN, upper + MARGIN)
 
     def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
-        """Which views vote about the box, from copies of the masks that are coarser still."""
+        """Select the views that vote about the box, using even coarser masks."""
         few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation, coarse.cut)
         center = subject_center(few.masks, few.cameras)
         # The median, not the largest: with a mask of noise no sample would lie within the subject.
@@ -94,19 +95,12 @@ class SubjectBox(Options):
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
     ) -> DepthBounds:
-        """Bounds of all pixels within the subject's box.
-
-        Args:
-            batch: masks and cameras at full resolution.
-            coarse: the same at a lower one.
-            voting: [B, V], views whose masks are used.
-            lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
-            upper: [B, 3], that with the largest.
-        """
+        """Compute bounds of all pixels within the subject's box, from corner ``lower`` to ``upper`` [B, 3]
+        in metres; ``coarse`` are the masks at a lower resolution, ``voting`` the views to use."""
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
     def _valid(self, bounds: DepthBounds) -> DepthBounds:
-        """Bounds in front of the camera, moved apart where they are too close to each other."""
+        """Clamp bounds in front of the camera, and move them apart where they are too close."""
         near, far = (x.nan_to_num(nan=0.0).clamp(max=_FARTHEST) for x in (bounds.near, bounds.far))
         missing = (MIN_THICKNESS - (far - near)).clamp(min=0) / 2
         near = (near - missing).clamp(min=MIN_DEPTH)
@@ -120,13 +114,13 @@ def subject_box(
     tolerance: int = 0,
     cut: Bool[Tensor, "B V 4"] | None = None,
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
-    """The axis-aligned box of the visual hull.
+    """Axis-aligned bounding box of the visual hull.
 
-    Carved twice: the second grid fills the box of the first. If nothing is left (contradicting
-    masks), the box before that pass stays.
+    Carved in two passes: the second grid fills the box of the first. If nothing remains
+    (contradicting masks), the box before that pass is kept.
 
     Args:
-        masks: a view with an empty mask does not vote.
+        masks: the subject's pixels; a view with an empty mask does not vote.
         cameras: [B, V], whose pixels are those of the masks.
         radius: dilation of the masks in pixels.
         tolerance: number of views in which a kept point may lie outside the mask.
@@ -145,13 +139,12 @@ def subject_box(
         lower, upper = corners
         cell = (upper - lower) / CELLS
         depth = in_cameras((lower + upper) / 2, cameras.extrinsics)[..., 2]
-        # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of
-        # the box's middle.
+        # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of the box's centre.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius, grow)
         kept = _carve(votes_outside(grown, voting, cut), cameras, lower, cell, tolerance)
-        # For each axis, the slices with a kept cell.
+        # Slices with a kept cell, for each axis.
         slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
         first, last = first_and_last(slices)
         ends = torch.stack((first, last + 1))
@@ -162,15 +155,8 @@ def subject_box(
 def _carve(
     outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, tolerance: int
 ) -> Bool[Tensor, "B n n n"]:
-    """Cells of a grid of :data:`CELLS` along each side that the views keep.
-
-    Args:
-        outside: uint8 [B, V, h, w], 1 where a pixel of a voting view is outside the subject.
-        cameras: [B, V], whose pixels are those of ``outside``.
-        lower: [B, 3], the corner of the grid with the smallest coordinates, in metres.
-        cell: [B, 3], sides of a cell in metres.
-        tolerance: number of views in which a kept cell may lie outside the mask.
-    """
+    """Cells of a grid that at most ``tolerance`` views vote out; the grid starts at ``lower`` [B, 3] with
+    cells of size ``cell`` [B, 3], in metres."""
     steps = constant(torch.arange, CELLS, like=lower) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
@@ -184,33 +170,25 @@ def _carve(
 
 
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
-    """A generous radius of the subject from each view.
-
-    Args:
-        masks: the subject's pixels.
-        cameras: [B, V], of the masks.
-        center: of the subject, in metres.
-
-    Returns:
-        Radius [B, V] about ``center`` in metres; NaN for an empty mask.
-    """
+    """Generous radius [B, V] in metres of the subject about ``center``, estimated from each view; NaN for
+    an empty mask."""
     pixel, depth = project(center[:, None].expand(*cameras.shape, 3), cameras.intrinsics, cameras.extrinsics)
     extents = [
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
         for dim, line in enumerate(pixel_axes(cameras))
     ]
     extent = torch.stack(extents, -1) / focal_lengths(cameras)
-    # 1.4: parts that point away from the camera look shorter than they are.
+    # 1.4: limbs along the viewing direction look shorter than they are.
     reach = 1.4 * extent.norm(dim=-1) * depth.clamp(min=NEAREST)
     return torch.where(masks.flatten(2).any(-1), reach, torch.nan)
 
 
 class NoBounds(Options):
-    """The stage of a model without bounds, as in the authors' release."""
+    """Bounds stage of a model without bounds, as in the authors' release."""
 
     group = "bounds"
     is_bounded: ClassVar[bool] = False
 
     def __call__(self, batch: Batch) -> None:
-        """None: there are no bounds."""
+        """Return None."""
         return None

@@ -1,6 +1,8 @@
-"""Near and far of each pixel from the visual hull of the other views. The rays of the subject's
-pixels are marched through the subject's box; depths that the masks of the *other* views allow are
-kept: the image-based visual hull (Matusik et al. 2000). Nothing here has a gradient."""
+"""Near and far of each pixel from the visual hull of the other views.
+
+Rays of the subject's pixels are marched through the subject's box, and depths that the masks of the
+*other* views allow are kept: the image-based visual hull (Matusik et al., 2000). Nothing here has a
+gradient."""
 
 import torch
 from jaxtyping import Bool, Int
@@ -24,27 +26,20 @@ from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 
 class VisualHull(SubjectBox):
-    """``bounds(batch) -> DepthBounds``: where each ray of the subject enters and leaves the visual
-    hull. Other pixels, and rays that miss the hull, have the bounds of the box."""
+    """``bounds(batch) -> DepthBounds``: depths at which each ray of the subject enters and leaves the
+    visual hull. Other pixels, and rays that miss the hull, get the bounds of the box."""
 
     samples: int = Field(48, ge=2, le=4096)
-    """Depths that are tried along each ray"""
+    """Number of depths that are tested along each ray"""
 
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
     ) -> DepthBounds:
-        """As in :class:`SubjectBox`, but within the hull for the subject's pixels.
-
-        Args:
-            batch: masks and cameras at full resolution.
-            coarse: the same at a lower one, at which rays are marched.
-            voting: [B, V], views whose masks are used.
-            lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
-            upper: [B, 3], that with the largest.
-        """
+        """As in :class:`SubjectBox`, but within the hull for the subject's pixels; rays are marched at the
+        resolution of ``coarse``."""
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
-        # At least one cell: the rays of a cell's pixels run next to the ray of its centre.
+        # At least one cell: the rays of a cell's pixels differ from the ray of its centre.
         radius = max(coarse.dilation, 1)
         rays = batch.pixels if coarse.stride == 1 else None
         count = bucket_size(sum(extent.cells(coarse.stride) for extent in batch.extents))
@@ -66,25 +61,25 @@ def hull_bounds(
     count: int | None = None,
     cut: Bool[Tensor, "B V 4"] | None = None,
 ) -> DepthBounds:
-    """First and last depth within ``start`` that the dilated masks of the other views allow.
+    """First and last depths within ``start`` that the dilated masks of the other views allow.
 
     Pixels outside the subject, and rays that miss the hull, keep the bounds of ``start``.
 
     Args:
         masks: the subject's pixels, whose rays are marched.
         cameras: [B, V], whose pixels are those of the masks.
-        start: bounds [B, V, h, w] in metres, between which depths are tried.
+        start: bounds [B, V, h, w] in metres, between which depths are tested.
         radius: dilation of the masks in pixels.
         tolerance: number of other views in which an allowed depth may lie outside the mask.
-        samples: depths that are tried along each ray.
+        samples: number of depths that are tested along each ray.
         rays: indices of the masks' pixels, if known.
         voting: views whose masks are used; None: those whose mask is not empty.
-        count: the masks have no more pixels than this, which avoids a device-to-host synchronisation;
-            None: unknown.
+        count: upper limit of the number of the masks' pixels, which avoids a device-to-host
+            synchronisation; None: unknown.
         cut: sides of the frame that cut the subject; None: those that the masks touch.
 
     Returns:
-        Bounds [B, V, h, w] in metres, half a step outside the depths that were tried.
+        Bounds [B, V, h, w] in metres, half a step outside the first and last allowed depths.
     """
     voting = masks.flatten(2).any(-1) if voting is None else voting
     cut = cut_sides(masks) if cut is None else cut
@@ -100,7 +95,6 @@ def hull_bounds(
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
-    """Values of cells for their ``stride`` x ``stride`` pixels each,
-    cropped to ``size`` (height, width)."""
+    """Repeat values of cells for their ``stride`` x ``stride`` pixels, cropped to ``size`` (height, width)."""
     values = values.repeat_interleave(stride, -2).repeat_interleave(stride, -1)
     return values[..., : size[0], : size[1]]

@@ -1,5 +1,6 @@
-"""Rays of pixels, and masks as silhouettes: dilated, and sampled at projected points. A ray is a
-function of z-depth: ``point(z) = center + z * direction``."""
+"""Rays of pixels, and silhouettes: masks that are dilated and sampled at projected points.
+
+A ray is a function of depth z: ``point(z) = center + z * direction``."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -22,7 +23,7 @@ from ghgs_lit.types import Cameras, DepthBounds
 
 
 def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
-    """Direction of each pixel's ray: displacement in the world, in metres, per metre of z-depth."""
+    """Direction of each pixel's ray: displacement in the world, in metres, per metre of depth z."""
     intrinsics = at_least_float32(cameras.intrinsics)
     extrinsics = at_least_float32(cameras.extrinsics)
     centers = homogeneous_centers(cameras.height, cameras.width, intrinsics)
@@ -31,34 +32,32 @@ def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
 
 
 def projection_matrices(cameras: Cameras) -> Float[Tensor, "*batch 3 4"]:
-    """``K [R t]``, which maps homogeneous world points to homogeneous pixels."""
+    """Matrices ``K [R t]``, which map homogeneous world points to homogeneous pixels."""
     return at_least_float32(cameras.intrinsics) @ at_least_float32(cameras.extrinsics)[..., :3, :]
 
 
 def pixel_axes(cameras: Cameras) -> tuple[Float[Tensor, " w"], Float[Tensor, " h"]]:
-    """Coordinates of the pixel centres along a row (columns + 0.5) and along a column
-    (rows + 0.5)."""
+    """Coordinates of pixel centres along a row (columns + 0.5) and along a column (rows + 0.5)."""
     centers = pixel_centers(cameras.height, cameras.width, at_least_float32(cameras.intrinsics))
     return centers[0, :, 0], centers[:, 0, 1]
 
 
 def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> DepthBounds:
-    """Depths at which the ray of each pixel enters and leaves an axis-aligned box.
-
-    By slabs (Kay and Kajiya, SIGGRAPH 1986).
+    """Depths at which the ray of each pixel enters and leaves an axis-aligned box, by the slab method
+    (Kay and Kajiya, SIGGRAPH 1986).
 
     Args:
         cameras: [B, V].
-        lower: the corner with the smallest coordinates, in metres.
-        upper: that with the largest.
+        lower: corner of the box with the smallest coordinates, in metres.
+        upper: corner with the largest coordinates.
 
     Returns:
-        Bounds [B, V, h, w] in metres, perhaps behind the camera; for a ray that misses the box, the
+        Bounds [B, V, h, w] in metres, possibly behind the camera; for a ray that misses the box, the
         range of depths of the whole box.
     """
     directions = ray_directions(cameras)
     centers = cameras.centers[:, :, None, None]
-    # A ray along a face: 1e-12 instead of 0 gives the right infinities without 0 / 0.
+    # For rays parallel to a face: 1e-12 instead of 0 gives the right infinities without 0 / 0.
     directions = torch.where(directions.abs() < 1e-12, 1e-12, directions)
     faces = [(face[:, None, None, None] - centers) / directions for face in (lower, upper)]
     near = torch.minimum(*faces).amax(-1)
@@ -83,10 +82,10 @@ class Silhouettes:
     """Masks at a lower resolution.
 
     Attributes:
-        masks: of cells.
-        cameras: whose pixels are the cells.
+        masks: masks of cells.
+        cameras: cameras whose pixels are the cells.
         stride: side of a cell in pixels.
-        dilation: of the masks, in cells.
+        dilation: dilation of the masks, in cells.
         cut: sides of the frame that cut the subject, as in :func:`cut_sides`.
     """
 
@@ -98,22 +97,15 @@ class Silhouettes:
 
 
 def cut_sides(masks: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch 4"]:
-    """Whether masks touch the first and the last row,
-    the first and the last column of their frames."""
+    """Whether masks touch the first row, last row, first column and last column of their frames."""
     sides = [_ends(masks, axis).any(-3 - axis) for axis in (-2, -1)]
     return torch.cat([side.expand(*side.shape[:-1], 2) for side in sides], -1)
 
 
 def _ends(values: Tensor, axis: int) -> Tensor:
-    """The first and the last line of values along an axis, of a single line that one.
+    """View of the first and last line along an axis (-2 or -1), or of the only one.
 
-    Args:
-        values: [..., h, w].
-        axis: -2 or -1.
-
-    Returns:
-        A view: a list of places would be copied to a GPU.
-    """
+    A slice, since a list of indices would be copied to a GPU."""
     places = slice(None, None, max(values.shape[axis] - 1, 1))
     return values[..., places, :] if axis == -2 else values[..., places]
 
@@ -125,13 +117,13 @@ def silhouettes(
     dilation: float,
     cut: Bool[Tensor, "B V 4"] | None = None,
 ) -> Silhouettes:
-    """Masks at a lower resolution, to limit the cost of a search.
+    """Downsample masks, to limit the cost of a search; a cell is True if any of its pixels is.
 
     Args:
-        masks: a cell is part of the subject if one of its pixels is.
+        masks: the subject's pixels.
         cameras: [B, V], of the masks.
         resolution: largest number of cells along the image's longer side.
-        dilation: fraction of the image's longer side; that of the result is in cells, rounded up.
+        dilation: fraction of the image's longer side; converted to cells, rounded up.
         cut: sides of the frame that cut the subject; None: those that the masks touch.
     """
     cut = cut_sides(masks) if cut is None else cut
@@ -148,25 +140,18 @@ def silhouettes(
 def dilate(
     masks: Bool[Tensor, "*batch h w"], radius: int, more: Int[Tensor, " b"] | None = None
 ) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown along both axes, by squares.
+    """Dilate masks by squares.
 
     Args:
-        masks: of elements along the first dimension.
-        radius: pixels by which all masks grow.
-        more: pixels by which those of each element grow more; None: 0.
+        masks: masks of b elements along the first dimension.
+        radius: radius in pixels.
+        more: additional radius of each element; None: 0.
     """
     return _grown(_grown(masks, radius, more, -2), radius, more, -1)
 
 
 def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
-    """:func:`dilate` along one axis, at a cost that does not depend on the radius.
-
-    Args:
-        masks: bool [..., h, w].
-        radius: in pixels.
-        more: [b], further pixels of each element; None: 0.
-        axis: -2 or -1.
-    """
+    """:func:`dilate` along one axis (-2 or -1), at a cost independent of the radius."""
     if more is not None:
         radius = radius + more.view(-1, *[1] * (masks.dim() - 1))
     size = masks.shape[axis]
@@ -182,15 +167,14 @@ def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor
 def votes_outside(
     dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"], cut: Bool[Tensor, "B V 4"]
 ) -> UInt8[Tensor, "B V h w"]:
-    """1 where a pixel of a voting view is outside the subject.
+    """Votes of pixels against the subject: 1 where a pixel of a voting view is outside it.
 
-    Beyond a side of the frame that cuts the subject nothing was observed. Points there are sampled
-    at the nearest border pixel (:func:`look_up`), so that the border of such a side is 0
-    everywhere.
+    Beyond a side of the frame that cuts the subject, nothing was observed. Points there are sampled
+    at the nearest border pixel (:func:`look_up`), so the border of such a side is 0 everywhere.
 
     Args:
-        dilated: masks, grown because real ones are noisy.
-        voting: values of other views are 0.
+        dilated: masks, dilated because real ones are noisy.
+        voting: views that vote; others are 0.
         cut: sides that cut the subject, as in :func:`cut_sides`.
     """
     outside = dilated < voting[..., None, None]
