@@ -95,6 +95,6 @@ def hull_bounds(
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
-    """Repeat values of cells for their ``stride`` x ``stride`` pixels, cropped to ``size`` (height, width)."""
+    """Repeat values of cells for their ``stride`` x ``stride`` pixels; crop to ``size`` (height, width)."""
     values = values.repeat_interleave(stride, -2).repeat_interleave(stride, -1)
     return values[..., : size[0], : size[1]]

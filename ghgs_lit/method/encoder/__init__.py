@@ -1,4 +1,4 @@
-"""The encode stage: VGGT's aggregator of any size over patch tokens."""
+"""The encoder stage: VGGT's aggregator, of any size, over patch tokens."""
 
 from ghgs_lit.method.encoder.encoder import VGGTEncoder, VGGTOptions
 

@@ -1,8 +1,9 @@
 """Pre-norm transformer block with LayerScale, for the ViT and, with normalised and rotated q and
-k, for the aggregator. The rotary position embedding (RoPE) has two dimensions: half of a head
-turns with the row, half with the column. Angles are float32 or wider for tokens of any precision:
-rounding an angle to bfloat16 would change its cosine by up to 6e-2, rounding the cosine itself
-only by 2e-3."""
+k, for the aggregator.
+
+The rotary position embedding (RoPE) is two-dimensional: half of a head's channels rotate with the
+row, half with the column. Angles are float32 or wider for tokens of any precision: rounding an angle
+to bfloat16 would change its cosine by up to 6e-2, rounding the cosine itself only by 2e-3."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,15 +31,12 @@ class Rotary(NamedTuple):
 
 
 def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
-    """Rotary tables of all tokens.
+    """Rotary tables [t, d] of all tokens.
 
     Args:
         positions: row and column of each token [t, 2].
         head_width: channels d of a head, divisible by 4.
         like: the tokens; tables are float64 for tokens in float64, else float32.
-
-    Returns:
-        Tables [t, d].
     """
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
@@ -51,20 +49,17 @@ def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) 
 
 
 def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*batch t d"]:
-    """Rotate channels ``m`` and ``m + d/4`` of each half of a head.
+    """Rotate channels ``m`` and ``m + d/4`` of each half of a head, in the wider dtype of both arguments.
 
     Args:
         x: queries or keys [..., t, d].
-        rotary: of these t tokens.
-
-    Returns:
-        [..., t, d], in the wider dtype of both.
+        rotary: tables of these t tokens.
     """
     quarters = x.unflatten(-1, (2, 2, x.shape[-1] // 4))
     return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)
 
 
-#: Values of queries or keys that are rotated at once without a gradient, to save memory.
+#: Largest number of query or key values rotated at once without a gradient, to save memory.
 _ROTATED = 1 << 18  # on a CPU
 _GPU_ROTATED = 1 << 25
 
@@ -75,7 +70,7 @@ class Attention(nn.Module):
     Args:
         width: channels of the tokens.
         heads: number of heads, which divides ``width``.
-        qk_norm: layer norm of q and k over the channels of each head, before their rotation.
+        qk_norm: apply layer norm to q and k over the channels of each head, before their rotation.
     """
 
     def __init__(self, width: int, heads: int, qk_norm: bool):
@@ -93,13 +88,13 @@ class Attention(nn.Module):
         rotary: Rotary | None = None,
         real: Bool[Tensor, " t"] | None = None,
     ) -> Float[Tensor, "t c"]:
-        """Attend inside each sequence.
+        """Attend within each sequence.
 
         Args:
-            x: tokens of all sequences, one after another.
-            lengths: tokens of each sequence, inside which attention stays.
+            x: tokens of all sequences, concatenated.
+            lengths: number of tokens of each sequence.
             rotary: tables of all tokens; None: no rotation.
-            real: tokens that others attend to, where all sequences have one length; None: all.
+            real: tokens that can be attended to, if all sequences have the same length; None: all.
         """
         q, k, v = rearrange(self.qkv(x), "t (s a d) -> s a t d", s=3, a=self.heads)
         q = self._norm_and_rotate(q, self.q_norm, rotary)
@@ -108,7 +103,7 @@ class Attention(nn.Module):
             each = (rearrange(values, "a (n t) d -> n a t d", n=len(lengths)) for values in (q, k, v))
             keys = None if real is None else real.view(len(lengths), 1, 1, -1)
             return self.proj(attend(*each, keys).flatten(0, 1))
-        # One by one: a block mask would also compute the products between different sequences.
+        # One by one: with a block mask, products between different sequences would be computed, too.
         parts = zip(*(values[None].split(lengths, dim=2) for values in (q, k, v)), strict=True)
         return self.proj(torch.cat([attend(*part, None)[0] for part in parts]))
 
@@ -128,27 +123,19 @@ class Attention(nn.Module):
 #: Register tokens of each view in the ViT and in the aggregator.
 REGISTERS = 4
 
-#: Hidden values of the MLP in memory at once without a gradient.
+#: Largest number of hidden values of the MLP in memory at once without a gradient.
 _HIDDEN = 1 << 23  # on a CPU
 _GPU_HIDDEN = 1 << 28
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:
-    """Samples normal ``values`` in place, but not on the meta device,
-    where PyTorch would import its compiler.
-
-    Args:
-        values: any tensor.
-        std: standard deviation; the mean is 0.
-
-    Returns:
-        ``values``.
-    """
+    """Fill ``values`` with samples of a normal distribution of mean 0, except on the meta device, where
+    PyTorch would import its compiler; returns ``values``."""
     return values if values.is_meta else values.normal_(std=std)
 
 
 class LayerScale(nn.Module):
-    """Adds a branch to the residual stream, scaled by a learned ``gamma`` for each channel."""
+    """Adds a branch to the residual stream, scaled by a learned ``gamma`` per channel."""
 
     def __init__(self, width: int, init: float):
         super().__init__()
@@ -159,7 +146,7 @@ class LayerScale(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two linear layers with the exact GELU between them; the hidden width is ``4 * width``."""
+    """Two linear layers with an exact GELU in between; the hidden width is ``4 * width``."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -178,7 +165,7 @@ class Block(nn.Module):
         heads: attention heads, which divide ``width``.
         qk_norm: as for :class:`Attention`.
         norm_eps: epsilon of the layer norms.
-        layer_scale: first value of both gammas.
+        layer_scale: initial value of both gammas.
     """
 
     def __init__(self, width: int, heads: int, qk_norm: bool, norm_eps: float, layer_scale: float):
@@ -197,19 +184,11 @@ class Block(nn.Module):
         rotary: Rotary | None = None,
         real: Bool[Tensor, " t"] | None = None,
     ) -> Float[Tensor, "t c"]:
-        """Change the tokens of each sequence.
-
-        Args:
-            x: tokens of all sequences, one after another.
-            lengths: tokens of each sequence, inside which attention stays.
-            rotary: tables of all tokens; None: no rotation.
-            real: tokens that others attend to, where all sequences have one length; None: all.
-        """
+        """Apply the block; arguments as for :meth:`Attention.forward`."""
         x = self.ls1(x, self.attn(self.norm1(x), lengths, rotary, real))
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))
-        # x is the fresh result of ls1, so it can be changed in place,
-        # a part of the tokens at a time.
+        # x is the fresh result of ls1, so parts of it can be updated in place.
         for rows in even_parts(len(x), at_once(x.device, _HIDDEN, _GPU_HIDDEN) // (4 * x.shape[-1])):
             x[rows].addcmul_(self.mlp(self.norm2(x[rows])), self.ls2.gamma)
         return x
@@ -223,18 +202,12 @@ def run_block(
     rotary: Rotary | None = None,
     real: Bool[Tensor, " t"] | None = None,
 ) -> Float[Tensor, "t c"]:
-    """``block(x)``, without recording gradients if neither ``x`` nor the block needs one.
+    """Run a block, without autograd if neither ``x`` nor the block needs a gradient.
 
     Args:
-        block: to run.
-        x: tokens of all sequences, one after another [t, c].
-        lengths: tokens of each sequence, inside which attention stays.
+        block: the block to run.
+        x, lengths, rotary, real: as for :meth:`Attention.forward`.
         checkpointing: recompute activations in the backward pass.
-        rotary: tables of all tokens; None: no rotation.
-        real: tokens that others attend to, where all sequences have one length; None: all.
-
-    Returns:
-        Tokens [t, c].
     """
     needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
     with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):

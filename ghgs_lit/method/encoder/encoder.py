@@ -1,5 +1,5 @@
-"""The encode stage: input views and masks to tokens,
-by alternating attention inside and across views."""
+"""The encoder stage: input views and masks to tokens, by alternating attention within and across
+views."""
 
 import re
 from collections.abc import Iterator
@@ -37,15 +37,13 @@ class PatchOptions(Options):
 
     group = "encoder.vit"
     kind: Literal["conv", "stem", "dinov2"]
-    """conv, one convolution per patch | stem, a small convolutional stem | dinov2,
-    a ViT with registers"""
+    """conv: one convolution per patch | stem: a small convolutional stem | dinov2: a ViT with registers"""
     channels: Width | None = None
-    """Of kind=stem: channels after the first convolution;
-    doubled at each halving, up to the width"""
+    """kind=stem: channels after the first convolution; doubled at each halving, up to the width"""
     depth: Count | None = Field(None, le=1024)
-    """Of kind=dinov2: number of blocks"""
+    """kind=dinov2: number of blocks"""
     heads: Width | None = None
-    """Of kind=dinov2: attention heads of each block"""
+    """kind=dinov2: attention heads of each block"""
 
     @model_validator(mode="after")
     def _fields_are_those_of_the_kind(self) -> "PatchOptions":
@@ -58,44 +56,43 @@ class PatchOptions(Options):
 
 
 class VGGTOptions(Options):
-    """Input views and masks to tokens, by VGGT of any size."""
+    """VGGT encoder of any size: input views and masks to tokens."""
 
     group = "encoder"
     width: Width
     """Channels of the aggregator's tokens; a multiple of 4 * heads"""
     heads: Width
-    """Attention heads of its blocks"""
+    """Attention heads of the aggregator's blocks"""
     depth: int = Field(ge=1, le=1024)
-    """Pairs of a frame block and a global block"""
+    """Number of pairs of a frame block and a global block"""
     layers: tuple[int, ...]
-    """Pairs whose tokens are read out, ascending; the last pair is among them"""
+    """Indices of the pairs whose tokens are read out, ascending; the last pair must be included"""
     vit: PatchOptions
     """Patch embedding: images to patch tokens"""
     patch_size: int = Field(14, ge=1, le=1024)
-    """Side of a patch, pixels"""
+    """Side of a patch in pixels"""
     image_size: Side = 518
-    """Side of the square image whose patch positions a DINOv2 ViT stores, pixels;
-    a multiple of patch_size"""
+    """Side in pixels of the square image for which a DINOv2 ViT stores position embeddings; a multiple
+    of patch_size"""
     mask_input: bool = False
-    """true: the mask is a further input channel"""
+    """true: the mask is an additional input channel"""
     bounds_input: bool = False
-    """true: near and far are two further input channels (not with bounds.kind=none)"""
+    """true: near and far are two additional input channels (not with bounds.kind=none)"""
     semantic: SemanticOptions | None = None
-    """null: the patch tokens are the semantic features | those of a branch of blocks over single
-    views, which `ghgs pretext` trains and which does not learn afterwards"""
+    """Semantic features: null, the patch tokens | otherwise those of a branch of blocks over single
+    views, which `ghgs pretext` trains and which is frozen afterwards"""
     layer_scale: float = 0.01
     """Initial LayerScale of the aggregator; 0.01 as published"""
     trainable: Text = "all"
-    """all | none | last_<n>: the last n pairs of blocks"""
+    """Trained weights: all | none | last_<n>, the last n pairs of blocks"""
     checkpointing: bool = False
     """true: recompute activations in the backward pass, to save memory"""
     precision: Literal["inherit", "bfloat16"] = "inherit"
-    """Of products of the encoder alone: inherit, that of the whole model (the paper's tables:
-    float32) | bfloat16, where the device has it: half the time on a GPU (the authors ran theirs
-    in float16)"""
+    """Precision of the encoder's products: inherit, as the whole model (the paper's tables: float32) |
+    bfloat16, where the device has it: half the time on a GPU (the authors used float16)"""
     weights: Text | None = None
-    """Name of the published weights that the semantic features learned from, or pretext; written by
-    ghgs import and ghgs pretext, a note for tables only"""
+    """Published weights that the semantic features come from, or pretext; written by ghgs import and
+    ghgs pretext, for tables only"""
 
     @model_validator(mode="after")
     def _parts_fit(self) -> "VGGTOptions":
@@ -117,15 +114,7 @@ class VGGTOptions(Options):
         return self
 
     def build(self, tokens: str = "all", margin: int = 1) -> "VGGTEncoder":
-        """The stage.
-
-        Args:
-            tokens: as for :class:`VGGTEncoder`.
-            margin: number of patches around these that are kept, too.
-
-        Returns:
-            The encoder with new weights.
-        """
+        """Build the stage with new weights; arguments as for :class:`VGGTEncoder`."""
         return VGGTEncoder(self, tokens, margin)
 
 
@@ -138,9 +127,9 @@ Pair = tuple[Float[Tensor, "t c"], Float[Tensor, "t c"]]
 class Aggregator(nn.Module):
     """Pairs of a frame block and a global block on patch tokens (VGGT, Wang et al., CVPR 2025).
 
-    Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and
-    register tokens, so it defines the frame of reference: another first view changes the result;
-    any other permutation of the views only permutes it.
+    Each view's sequence is [camera, registers, kept patches]. The first view has camera and register
+    tokens of its own and thus defines the frame of reference: choosing another first view changes the
+    result, any other permutation of the views only permutes it.
 
     Args:
         patch_embed: images [n, i, H, W] and :class:`KeptPatches` to tokens [N, width].
@@ -175,8 +164,8 @@ class Aggregator(nn.Module):
         """Tokens after the blocks of each read-out layer.
 
         Args:
-            images: [b, v, i, H, W] as ``patch_embed`` takes them.
-            kept: patches that are encoded; all others have no influence.
+            images: [b, v, i, H, W], inputs of ``patch_embed``.
+            kept: patches to encode; all others have no influence.
 
         Returns:
             Packed tokens [t, c], special ones included, after the frame block and after the global
@@ -184,7 +173,7 @@ class Aggregator(nn.Module):
         """
         b, v = images.shape[:2]
         patches = self.patch_embed(images.flatten(0, 1), kept)
-        # Camera and register tokens: number 0 for the first view, number 1 for all others.
+        # Camera and register tokens: index 0 for the first view, index 1 for all others.
         tokens = torch.cat((self.camera_token, self.register_token), dim=2)[0]
         special = torch.cat((tokens[:1], tokens[1:].expand(v - 1, -1, -1)))
         special = special.to(patches.dtype).repeat(b, 1, 1)
@@ -207,20 +196,19 @@ class Aggregator(nn.Module):
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
-#: Choices of ``skip.tokens`` that leave patches out.
+#: Values of ``skip.tokens`` that drop patches.
 KEPT = {"window": patches_in_window, "subject": patches_around_subject}
 
 
 class VGGTEncoder(nn.Module):
-    """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
+    """VGGT of any size: ``vggt_1b`` loads the published weights, smaller ones train from scratch.
 
     Args:
-        options: of the encoder.
-        tokens: ``all``; ``window``: patches of the smallest rectangle that holds the subject;
-            ``subject``: patches with a pixel of the subject. All others are dropped before
-            the first block. Kept patches keep their positions; a view with an empty mask has its
-            special tokens only.
-        margin: patches around these that are kept, too.
+        options: options of the encoder.
+        tokens: ``all``; ``window``: patches of the subject's bounding box; ``subject``: patches with
+            a pixel of the subject. All others are dropped before the first block. Kept patches keep
+            their positions; a view with an empty mask has its special tokens only.
+        margin: number of patches around these that are kept, too.
     """
 
     def __init__(self, options: VGGTOptions, tokens: str = "all", margin: int = 1):
@@ -234,7 +222,7 @@ class VGGTEncoder(nn.Module):
         self.bounds_input = options.bounds_input
         self.precision = options.precision
         extra = [0.5] * self.mask_input
-        # Not in checkpoints, so they need storage even in a model that is built on the meta device.
+        # Not in checkpoints, so they must be allocated even in a model built on the meta device.
         for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
             constant = torch.tensor((*values, *extra), device="cpu").view(-1, 1, 1)
             self.register_buffer(name, constant, persistent=False)
@@ -255,8 +243,7 @@ class VGGTEncoder(nn.Module):
 
     @property
     def keeps_features(self) -> bool:
-        """Whether tokens are read from disk in training,
-        which no CUDA graph can hold."""
+        """Whether tokens are read from disk in training, which rules out CUDA-graph capture."""
         return getattr(self.aggregator.patch_embed, "cache", None) is not None
 
     def forward(
@@ -270,16 +257,16 @@ class VGGTEncoder(nn.Module):
 
         Args:
             images: [b, v, 3, H, W] in [0, 1], with sides divisible by the patch size.
-            masks: [b, v, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, or
+            masks: [b, v, H, W]; used with ``mask_input``, ``bounds_input`` or ``semantic``, or
                 without a plan.
-            bounds: in metres; read with ``bounds_input``.
-            plan: None: one for the patches of :meth:`keeps`.
+            bounds: in metres; used with ``bounds_input``.
+            plan: plan of the batch; None: one for the patches of :meth:`keeps`.
 
         Returns:
-            Packed tokens with the layers that :attr:`VGGTOptions.layers` names.
+            Packed tokens with the layers of :attr:`VGGTOptions.layers`.
 
         Raises:
-            InputError: images are float64, and weights are not.
+            InputError: images are float64 but weights are not.
         """
         narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
         require(narrow, "images", "float32 where the weights are no float64", images.dtype)
@@ -293,14 +280,8 @@ class VGGTEncoder(nn.Module):
         return Tokens(latent, semantic, *places, kept.grid, self.patch_size, kept.real)
 
     def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
-        """Patches that ``tokens`` and ``margin`` keep.
-
-        Args:
-            masks: of the subject [b, v, H, W].
-
-        Returns:
-            Which patches [b, v, h, w]; on the CPU where the masks are not read.
-        """
+        """Select the patches to keep according to ``tokens`` and ``margin``; on the CPU with
+        ``tokens="all"``, which does not depend on the masks."""
         if self.tokens in KEPT:
             return KEPT[self.tokens](masks, self.patch_size, self.margin)
         b, v, height, width = masks.shape
@@ -318,16 +299,8 @@ class VGGTEncoder(nn.Module):
 
 
 def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Float[Tensor, "N C"]]:
-    """Patch tokens of each frame and global block, concatenated; empties ``pairs`` to free memory.
-
-    Args:
-        pairs: packed tokens [t, c] after both blocks, for each layer.
-        kept: the patches that take part.
-        special: number of special tokens in each image.
-
-    Yields:
-        Patch tokens [N, C] of a layer, C = 2 c.
-    """
+    """Concatenate the patch tokens of both blocks of each layer (C = 2 c); empties ``pairs`` to free
+    memory."""
     while pairs:
         yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 

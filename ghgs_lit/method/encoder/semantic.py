@@ -1,5 +1,4 @@
-"""Semantic features F of encoders without published weights:
-the body parts visible in a patch."""
+"""Semantic features F of encoders without published weights: body parts visible in a patch."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,8 +14,7 @@ from ghgs_lit.method.plan import Plan
 from ghgs_lit.method.plan.patches import KeptPatches
 
 NORM_EPS = 1e-5
-#: Body parts that ``ghgs pretext`` distinguishes (``training.pretext``):
-#: channels of a feature.
+#: Number of body parts that ``ghgs pretext`` distinguishes, and of channels of a feature.
 PARTS = 16
 
 
@@ -40,19 +38,14 @@ class SemanticOptions(Options):
         return self
 
     def build(self, patch_size: int) -> "SemanticBranch":
-        """The branch for patches of ``patch_size`` pixels."""
+        """Build the branch for patches of ``patch_size`` pixels."""
         return SemanticBranch(self, patch_size)
 
 
 def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
-    """Square roots of shares; their cosine is the overlap of two distributions
-    (Bhattacharyya's coefficient).
+    """Features of unit norm: square roots of the shares of parts in a patch.
 
-    Args:
-        log_shares: logarithms of the shares of the parts in a patch [N, p].
-
-    Returns:
-        Features [N, p] of norm 1.
+    Their cosine is the overlap of two distributions (Bhattacharyya coefficient).
     """
     return (0.5 * log_shares).exp()
 
@@ -61,12 +54,12 @@ class SemanticBranch(nn.Module):
     """A stem and a few blocks over the subject's patches of one view; ``ghgs pretext`` trains it.
 
     Features are square roots of the predicted shares of the parts in a patch. Their cosine, the
-    semantic consistency (Eq. 4), is then the overlap of two distributions (Bhattacharyya's
-    coefficient): 1 where they are equal, 0 where no part is shared.
+    semantic consistency (Eq. 4), is the overlap of two distributions (Bhattacharyya coefficient): 1
+    if they are equal, 0 if they share no part.
 
-    Attention is inside a view, among a learned token and the patches with a pixel of the
-    subject. Every choice of ``skip.tokens`` keeps these, so features depend on one image
-    and its mask alone."""
+    Attention stays within a view, among a learned token and the patches with a pixel of the
+    subject. Every value of ``skip.tokens`` keeps these, so features depend on one image and its mask
+    alone."""
 
     def __init__(self, options: SemanticOptions, patch_size: int):
         super().__init__()
@@ -85,21 +78,18 @@ class SemanticBranch(nn.Module):
         self.head = nn.Linear(width, self.parts)
 
     def subject(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
-        """The patches that have features."""
+        """Select the patches that have features."""
         return patches_around_subject(masks, self.patch_size, margin=0)
 
     def log_shares(
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], kept: KeptPatches
     ) -> Float[Tensor, "N p"]:
-        """Logarithms of the shares of parts in patches.
+        """Predict logarithms of the shares of parts in patches, in float32 or wider.
 
         Args:
             images: [b, v, 3, H, W] in [0, 1].
             masks: of the subject [b, v, H, W].
             kept: the patches of :meth:`subject`, or some of them.
-
-        Returns:
-            [N, p], float32 or wider.
         """
         x = torch.cat((images, masks[:, :, None].to(images.dtype)), dim=2).flatten(0, 1)
         patches = self.stem((2 * x - 1).to(self.token.dtype), kept)
@@ -112,15 +102,13 @@ class SemanticBranch(nn.Module):
     def forward(
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], plan: Plan
     ) -> Float[Tensor, "N p"]:
-        """Features of the kept patches.
+        """Features [N, p] of the patches ``plan.kept``; 0 (cosine 0 with all others) in those without the
+        subject.
 
         Args:
             images: [b, v, 3, H, W] in [0, 1].
             masks: of the subject [b, v, H, W].
-            plan: its ``kept`` have features, its ``shown_patches`` are computed.
-
-        Returns:
-            Features [N, p]; 0 (cosine 0 with all others) in patches without the subject.
+            plan: only its ``shown_patches`` are computed.
         """
         shown = plan.shown_patches
         features = features_of(self.log_shares(images, masks, shown))
@@ -128,5 +116,5 @@ class SemanticBranch(nn.Module):
         places = torch.searchsorted(plan.kept.index, shown.index)
         if shown.real is None:
             return features.new_zeros(count, self.parts).index_copy(0, places, features)
-        places = torch.where(shown.real, places, count)  # behind all others
+        places = torch.where(shown.real, places, count)  # padding goes to an extra row
         return features.new_zeros(count + 1, self.parts).index_copy(0, places, features)[:count]

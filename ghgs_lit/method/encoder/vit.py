@@ -15,7 +15,7 @@ from ghgs_lit.method.plan.patches import KeptPatches
 
 
 class PatchEmbed(nn.Module):
-    """A linear projection of each patch, as one convolution."""
+    """Linear projection of each patch, as one convolution."""
 
     def __init__(self, in_channels: int, width: int, patch_size: int):
         super().__init__()
@@ -36,23 +36,22 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-#: Patches around a kept one that it depends on: the adjacent one is mixed in,
-#: whose receptive field reaches into its neighbour.
+#: Patches around a kept one that it depends on: adjacent patches are mixed in, whose receptive fields
+#: reach into their neighbours.
 _REACH = 2
 
 
 class ConvStem(nn.Module):
-    """Overlapping convolutions, with which a small encoder learns edges and the
-    silhouette much sooner.
+    """Overlapping convolutions, with which a small encoder learns edges and the silhouette much sooner.
 
-    The image is halved while the patch size is even; a strided convolution does the rest; a last
-    one mixes neighbouring patches.
+    Strided convolutions halve the image as long as the patch size is even, a last one covers the rest
+    of the patch, and another mixes neighbouring patches.
 
     Args:
-        in_channels: of the images.
+        in_channels: channels of the images.
         width: channels of a token.
         patch_size: side of a patch in pixels.
-        channels: after the first convolution; doubled at each halving, up to ``width``.
+        channels: channels after the first convolution; doubled at each halving, up to ``width``.
     """
 
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):
@@ -89,7 +88,7 @@ class VisionTransformer(nn.Module):
     Tokens of an image are in the order class, registers, kept patches.
 
     Args:
-        in_channels: of the images.
+        in_channels: channels of the images.
         width: channels of a token.
         depth: number of blocks.
         heads: attention heads of each block, which divide ``width``.
@@ -137,16 +136,8 @@ class VisionTransformer(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def positions(self, height: int, width: int, dtype: torch.dtype) -> Float[Tensor, "1 t c"]:
-        """Position embedding of the class token and the patches of an image, resampled in float32.
-
-        Args:
-            height: number of rows of patches.
-            width: number of columns of patches.
-            dtype: of the result.
-
-        Returns:
-            [1, 1 + height * width, c].
-        """
+        """Position embeddings [1, 1 + height * width, c] of the class token and of ``height`` x ``width``
+        patches, resampled in float32 and converted to ``dtype``."""
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if (height, width) == (side, side):
             return self.pos_embed.to(dtype)
@@ -156,15 +147,8 @@ class VisionTransformer(nn.Module):
         return torch.cat((table[:, :1], grid.flatten(2).mT), dim=1).to(dtype)
 
     def embed(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
-        """Packed input of the first block, with the position embeddings of the whole image.
-
-        Args:
-            images: n images with sides divisible by the patch size [n, i, H, W].
-            kept: the patches that take part.
-
-        Returns:
-            Class, register and patch tokens [t, c].
-        """
+        """Packed class, register and patch tokens before the first block, with position embeddings of the
+        whole image; sides of images must be divisible by the patch size."""
         n, _, height, width = images.shape
         patches = self.patch_embed.dense(images)
         positions = self.positions(height // self.patch_size, width // self.patch_size, patches.dtype)
@@ -172,15 +156,7 @@ class VisionTransformer(nn.Module):
         return kept.join(special.expand(n, -1, -1), kept.select(patches + positions[:, 1:]))
 
     def tokens(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
-        """Tokens after the final norm.
-
-        Args:
-            images: n images with sides divisible by the patch size [n, i, H, W].
-            kept: the patches that take part.
-
-        Returns:
-            Packed class, register and patch tokens [t, c].
-        """
+        """Packed class, register and patch tokens after the final norm."""
         x = self.embed(images, kept)
         lengths = kept.lengths(self.special)
         real = kept.real_tokens(self.special)

@@ -1,5 +1,5 @@
-"""Raw attributes of Gaussians and their activations: in footprints of pixels,
-or as in the authors' release."""
+"""Raw attributes of Gaussians and their activations: in footprints of pixels, or as in the authors'
+release."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from ghgs_lit.ops.activation import (
     Constants,
 )
 
-#: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1
-#: where there is no limit; and the default limit.
+#: Offset in metres of a Gaussian from its pixel's point along each axis for a raw value of 1, if there
+#: is no limit; also the default limit.
 OFFSET_UNIT = 0.05
-#: The largest scale in footprints: a splat as large as a limb would hide errors beneath it.
+#: Largest scale in footprints: a splat as large as a limb would hide errors beneath it.
 SCALE_CAP = 4.0
-#: Opacity at the start of training: high, since transparent splats do not recover.
+#: Initial opacity: high, since transparent splats do not recover in training.
 OPACITY_START = 0.8
 
 
@@ -40,14 +40,14 @@ class RawGaussians:
     """Attributes before their activations, and the descriptors that they are computed from.
 
     Attributes:
-        descriptors: of the Gaussians' pixels, from the dense head.
-        offset: from the point of the pixel.
-        scale: along three axes.
-        rotation: a quaternion less the one without rotation, where attributes are in footprints.
-        opacity: 0 is the start of training, where attributes are in footprints.
-        color: change of the pixel's colour; None: none.
-        image: numbers of the images (``b * V + v``) that the Gaussians belong to, ascending.
-        pixel: row-major indices of their pixels.
+        descriptors: features of the Gaussians' pixels, from the dense head.
+        offset: offset from the point of the pixel.
+        scale: scales along three axes.
+        rotation: quaternion; with attributes in footprints, minus the identity.
+        opacity: with attributes in footprints, 0 is the initial value.
+        color: change of the pixel's colour; None: no change.
+        image: index ``b * V + v`` of the image that each Gaussian belongs to, ascending.
+        pixel: row-major index of its pixel in the image.
         splits: number of rows of each element.
         real: which rows become Gaussians, others get opacity 0; None: all.
     """
@@ -64,12 +64,7 @@ class RawGaussians:
     real: Bool[Tensor, " N"] | None = None
 
     def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
-        """The raw attributes plus a change, without a change of descriptors.
-
-        Args:
-            change: values of offset, scale, rotation, opacity and color,
-                :data:`RAW_VALUES` together.
-        """
+        """Add a change of offset, scale, rotation, opacity and color (:data:`RAW_VALUES` channels)."""
         offset, scale, rotation, opacity, color = change.split(_WIDTHS, -1)
         return dataclasses.replace(
             self,
@@ -82,22 +77,20 @@ class RawGaussians:
 
 
 class FootprintAttributes(Options):
-    """Raw values to attributes in units of a pixel's footprint, ``z / f`` metres; zeros give a
-    splat on the surface. The paper gives no values."""
+    """Attributes in units of a pixel's footprint, ``z / f`` metres; raw values of 0 give a splat on the
+    surface. The paper gives no values."""
 
     scale_floor: Positive = 0.15
-    """Least scale in footprints; it leaves no holes when splats are rendered at a higher
-    resolution."""
+    """Least scale in footprints; it prevents holes when splats are rendered at a higher resolution."""
     scale_start: Positive = 0.25
-    """Scale at which training starts, in footprints."""
+    """Initial scale in footprints."""
     thickness_start: Positive | None = None
-    """Scale of the third axis at which training starts, in footprints; null: as the others."""
+    """Initial scale of the third axis in footprints; null: as the others."""
     inward: Amount = 0.0
-    """Distance along the third axis to which training starts moving the splats, in footprints: with
-    axes of the surface, away from the camera. The part of a splat outside its pixel then ends at the
-    silhouette."""
+    """Initial distance of splats along the third axis, in footprints: with surface axes, away from the
+    camera. The part of a splat outside its pixel then ends at the silhouette."""
     opacity_floor: Share = 0.1
-    """Least opacity: below 1/255 a splat has no gradient left."""
+    """Least opacity: below 1/255 a splat gets no gradient."""
 
     @model_validator(mode="after")
     def _check(self) -> "FootprintAttributes":
@@ -116,23 +109,23 @@ class FootprintAttributes(Options):
 
     @property
     def scale_biases(self) -> tuple[float, float]:
-        """Biases of raw scales of the first two axes and of the third,
-        so that 0 gives the start."""
+        """Biases of the raw scales of the first two axes and of the third; raw values of 0 then give the
+        initial scales."""
         thickness = self.scale_start if self.thickness_start is None else self.thickness_start
         starts = (self.scale_start, thickness)
         return tuple(_logit(log(start / self.scale_floor) / self.scale_range) for start in starts)
 
     @property
     def opacity_bias(self) -> float:
-        """Bias of raw opacities, so that 0 gives the start."""
+        """Bias of raw opacities; a raw value of 0 then gives the initial opacity."""
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
     def constants(self, offset_limit: float | None, color_limit: float) -> Constants:
-        """Numbers of :func:`ghgs_lit.ops.activation.footprint_attributes`.
+        """Constants of :func:`ghgs_lit.ops.activation.footprint_attributes`.
 
         Args:
-            offset_limit: of ``gaussian_head``, in metres; None: none.
-            color_limit: of ``gaussian_head``.
+            offset_limit: ``gaussian_head.offset_limit`` in metres; None: no limit.
+            color_limit: ``gaussian_head.color_limit``.
         """
         offsets = (offset_limit or 0.0, OFFSET_UNIT, self.inward)
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
@@ -146,13 +139,6 @@ def release_attributes(
     opacity: Float[Tensor, " N"],
     footprint: Float[Tensor, " N"],
 ) -> Attributes:
-    """Attributes as in the authors' release: offsets and scales in metres, without bound.
-
-    Args:
-        offset: raw, as are the next three.
-        scale: raw.
-        rotation: raw.
-        opacity: raw.
-        footprint: not read.
-    """
+    """Activate raw attributes as in the authors' release: offsets and scales in metres, unbounded;
+    ``footprint`` is not used."""
     return offset, F.softplus(scale, beta=100), unit(rotation), opacity.sigmoid()

@@ -1,4 +1,4 @@
-"""Dense heads on windows around the subject."""
+"""Evaluation of dense heads in windows around the subject."""
 
 import functools
 import itertools
@@ -16,14 +16,14 @@ from ghgs_lit.method.plan.window import Span, Window
 from ghgs_lit.ops.pool import at_once, even_parts
 from ghgs_lit.types import Tokens
 
-#: Values of the largest map in memory at once without a gradient (32 MB in float32); on a GPU 4 GB.
+#: Values of the largest map held in memory without a gradient (32 MB in float32); on a GPU 4 GB.
 _LARGEST = 1 << 23
 _GPU_LARGEST = 1 << 30
 
 
 @dataclass(frozen=True)
 class Part:
-    """Maps of consecutive images in one window."""
+    """Maps of consecutive images in a common window."""
 
     images: slice
     window: Window
@@ -37,21 +37,18 @@ def decode(
     windows: Sequence[Window | None] | None,
     together: int = 1,
 ) -> Iterator[Part]:
-    """Maps of the images in their windows, in the order of the images.
+    """Decode raw maps of images in their windows, yielding consecutive images in order.
 
     Images with small maps share a window. Without a gradient, larger maps are computed one after
     another, each in its own window, to save memory and work.
 
     Args:
         dpt: the head.
-        tokens: of all images.
-        guide: maps of whole images, if the head has one.
-        windows: one for each image; None: whole images. An image without a window is left out; if
-            all are, one pixel is decoded, so that gradients of 0 flow.
-        together: number of consecutive images that are decoded at once at least.
-
-    Yields:
-        Raw maps of consecutive images.
+        tokens: tokens of all images.
+        guide: maps of whole images, if the head has a guide.
+        windows: one per image; None: whole images. Images without a window are left out; if all are,
+            one pixel is decoded, so that gradients of 0 flow.
+        together: least number of consecutive images that are decoded at once.
     """
     b, v, rows, columns = tokens.grid
     size = (tokens.patch_size * rows, tokens.patch_size * columns)
@@ -68,13 +65,8 @@ def decode(
 
 
 def _runs(windows: Sequence[Window | None], most: int, together: int) -> Iterator[slice]:
-    """Slices of consecutive images that have a window, of about equal size.
-
-    Args:
-        windows: one for each image; None where there is none.
-        most: images of a slice, if these are ``together`` or more.
-        together: images that are not parted.
-    """
+    """Slices of about equal size of consecutive images with a window: at most ``most`` images, in groups
+    of ``together`` that are not split."""
     start = 0
     for has_window, group in itertools.groupby(windows, bool):
         count = len(list(group))

@@ -1,4 +1,4 @@
-"""The depth stage: one z-depth and one confidence for each pixel (paper, section 3.2)."""
+"""The depth stage: depth z and a confidence for each pixel (paper, section 3.2)."""
 
 from collections.abc import Iterable
 from math import log
@@ -22,8 +22,7 @@ from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
 
 
 def _bounded_inverse(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    """Depth linear in ``1 / z``: equal steps of the fraction are equal steps in the image of
-    another view."""
+    """Interpolate linearly in ``1 / z``: equal steps of the fraction are equal steps in another image."""
     return near * far / (far * (1 - fraction) + near * fraction)
 
 
@@ -31,31 +30,28 @@ def _linear(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
     return near + (far - near) * fraction
 
 
-#: Functions from a fraction of the way from near (0) to far (1) to depth.
+#: Functions from a fraction between near (0) and far (1) to depth.
 BOUNDED = {"bounded_inverse": _bounded_inverse, "linear": _linear}
 
 
 def bounded_depth(
     raw: Float[Tensor, "*n"], near: Float[Tensor, "*n"], far: Float[Tensor, "*n"], parameterization: str
 ) -> Float[Tensor, "*n"]:
-    """Depth between bounds from raw values of a head.
+    """Convert raw values of a head to depths z between bounds, in metres.
 
     Args:
-        raw: of a head; 0 is half of the way, as the parameterization counts it.
+        raw: outputs of a head; 0 is halfway in the given parameterization.
         near: in metres.
         far: in metres.
         parameterization: one of :data:`BOUNDED`.
-
-    Returns:
-        Z-depth in metres.
     """
     return BOUNDED[parameterization](bounded_sigmoid(raw), near, far)
 
 
 def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound.
+    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and unbounded.
 
-    Infinite at -1e-8, where the gradient is 0. The argument is replaced, too, or the gradient would
+    Infinite at -1e-8, with a gradient of 0: the argument is replaced there, too, or the gradient would
     be 0 times infinity.
     """
     shifted = x + 1e-8
@@ -64,22 +60,20 @@ def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 class DepthHeadOptions(Options):
-    """Tokens to one depth and one confidence for each pixel, by a dense head."""
+    """Depth head: tokens to a depth and a confidence for each pixel."""
 
     group = "depth_head"
     rectified_skip: bool = True
-    """Residual units add what they rectified, as published weights expect;
-    in training it can die."""
+    """Residual units add the rectified input, as published weights expect; in training, units can die."""
     guide: bool = False
-    """Adds images, masks and bounds at full resolution to the input of the dense head;
-    the paper: false."""
+    """Add images, masks and bounds at full resolution to the input of the dense head (paper: false)."""
     consistency_depths: int = Field(0, ge=0, le=4096)
-    """Number of depths between near and far whose photo-consistency is added to the guide; the paper: 0."""
+    """Number of depths between near and far whose photo-consistency is added to the guide (paper: 0)."""
     parameterization: Literal["bounded_inverse", "linear", "inverse_linear"] = "bounded_inverse"
-    """bounded_inverse, linear: in 1 / z or in z between the near and far of each pixel;
+    """bounded_inverse, linear: linear in 1 / z or in z between near and far of each pixel;
     inverse_linear: without bounds, for the authors' weights only."""
     start: float = Field(0.5, gt=0, lt=1)
-    """Depth at which training starts, as a share of the way from near to far."""
+    """Initial depth, as a fraction between near (0) and far (1)."""
 
     @model_validator(mode="after")
     def _check(self) -> "DepthHeadOptions":
@@ -95,12 +89,12 @@ class DepthHeadOptions(Options):
         return self.parameterization in BOUNDED
 
     def build(self, dim_latent: int) -> "DepthHead":
-        """The stage for tokens of width ``dim_latent``."""
+        """Build the stage for tokens of width ``dim_latent``."""
         return DepthHead(self, dim_latent)
 
 
 class DepthHead(nn.Module):
-    """Depth and confidence of each pixel from the four layers of tokens, by a dense head."""
+    """Dense head that predicts depth and confidence of each pixel from four layers of tokens."""
 
     def __init__(self, options: DepthHeadOptions, dim_latent: int):
         super().__init__()
@@ -115,20 +109,19 @@ class DepthHead(nn.Module):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether depths lie between bounds, which :meth:`forward` then needs."""
+        """Whether depths lie between bounds, which :meth:`forward` then requires."""
         return self.options.is_bounded
 
     def forward(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> DepthMaps:
-        """Depths of all pixels; those of the subject are valid if they are finite.
+        """Predict depths in metres, and confidences of 1 or more as in published heads.
+
+        Depths are valid at pixels of the subject if they are finite.
 
         Args:
-            tokens: of the encoder.
+            tokens: tokens of the encoder.
             batch: images, masks and cameras are read.
-            bounds: in metres; None if :attr:`is_bounded` is false.
-            plan: only its ``depth_windows`` are decoded, and other depths have no meaning.
-
-        Returns:
-            Depths in metres, and confidences of 1 or more, as in published heads.
+            bounds: in metres; None if :attr:`is_bounded` is False.
+            plan: only its ``depth_windows`` are decoded; other depths are meaningless.
         """
         guide = None
         if self.dpt.guide is not None:
@@ -148,13 +141,13 @@ class DepthHead(nn.Module):
 
 
 def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBounds | None) -> DepthMaps:
-    """Depth maps in which depths that are not finite become 1 m and not valid.
+    """Build depth maps; depths that are not finite become 1 m and invalid.
 
     Args:
         depth: [B, V, H, W] in metres.
         batch: its masks define the valid pixels.
         confidence: [B, V, H, W].
-        bounds: that the depths lie between; None: none.
+        bounds: bounds of the depths, or None.
     """
     finite = depth.isfinite()
     return DepthMaps(torch.where(finite, depth, 1.0), batch.masks & finite, confidence, bounds)
@@ -163,15 +156,9 @@ def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBo
 def _whole(
     parts: Iterable[Part], batch: Batch, wanted: Bool[Tensor, "B V H W"] | None
 ) -> Float[Tensor, "o B V H W"]:
-    """Decoded windows in maps of whole images, float32 or wider.
+    """Paste decoded windows into maps of whole images, float32 or wider; 0 outside ``wanted``.
 
-    Images share windows, so the rest of a window depends on other subjects of the batch.
-
-    Args:
-        parts: of all images that have a window.
-        batch: its masks give the size.
-        wanted: pixels that keep their values, others are 0; None: all.
-    """
+    Images share windows, so values elsewhere in a window depend on other subjects of the batch."""
     whole = None
     for part in parts:
         if whole is None:

@@ -1,5 +1,7 @@
-"""Guides: full-resolution inputs of a dense head (images, masks and depths). A patch is one
-token, so a head whose only input is tokens predicts soft edges. Published weights use no guide."""
+"""Guides: full-resolution inputs of a dense head (images, masks and depths).
+
+A patch is one token, so a head with tokens as its only input predicts soft edges. Published weights
+use no guide."""
 
 import functools
 
@@ -17,28 +19,27 @@ from ghgs_lit.types import Batch
 PHOTO_CHANNELS = 4
 
 
-#: Maps whose channels form a guide; they are concatenated only in the window that is read.
+#: Maps whose channels form a guide; they are concatenated only within the window in use.
 Guide = tuple[Float[Tensor, "n _ H W"], ...]
 
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
-    """Images, masks or mattes, and further maps of all input views.
+    """Guide of images, mattes or masks, and further maps of all input views.
 
     Args:
         batch: images, masks and mattes are read.
-        maps: further ones, with any number of channels.
+        maps: further maps with any number of channels.
     """
     images = at_least_float32(batch.images)
     return tuple(part.flatten(0, 1) for part in (images, coverage(batch)[:, :, None], *maps))
 
 
 class GuidePyramid(nn.Module):
-    """Three convolutions of a guide, at full, half and quarter resolution,
-    added to maps of a dense head.
+    """Three convolutions of a guide, at full, half and quarter resolution, added to maps of a dense head.
 
     Args:
-        channels: of the guide.
-        features: of the half and the quarter resolution; the full one has half as many.
+        channels: channels of the guide.
+        features: channels at half and quarter resolution; the full one has half as many.
     """
 
     def __init__(self, channels: int, features: int):
@@ -51,8 +52,8 @@ class GuidePyramid(nn.Module):
         """Maps at full, half and quarter resolution.
 
         Args:
-            guide: of whole images.
-            targets: windows of the head's maps, from fine to coarse, that they are resized to.
+            guide: maps of whole images.
+            targets: windows of the head's maps, from fine to coarse, that the results are resized to.
         """
         whole = Window.whole(tuple(guide[0].shape[2:]))
         size = whole.full
@@ -64,7 +65,7 @@ class GuidePyramid(nn.Module):
         )
         seen = seen.coarser(4).finer(4, size)
         parts = [part[..., *seen.slices].permute(0, 2, 3, 1) for part in guide]
-        # channels are innermost
+        # Channels are innermost in memory.
         full = F.relu(self.to_full(torch.cat(parts, -1).permute(0, 3, 1, 2)))
         half = F.relu(self.to_half(full))
         maps = (full, half, F.relu(self.to_quarter(half)))
