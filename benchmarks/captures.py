@@ -1,13 +1,13 @@
-"""What imperfect captures cost a model: built-in people, photographed in twelve ways, with the same targets.
+"""Loss of quality by imperfect captures: built-in people, photographed in twelve ways, with the same targets.
 
     python benchmarks/captures.py model.ckpt
     python benchmarks/captures.py shipped --mend --people 12 --first 4
 
-Each capture has one trouble, the last one all of them; with ``--mend`` they are others, predicted as given
-and as ``ghgs predict`` mends them by itself. Photographs are taken before a background, twice as large as
-what the model sees, and go the way of a user's (``Capture``): they are cropped to the subject.
-Targets are always those of the clean rig, so that a loss is one of the prediction. Prints PSNR of exact
-photographs and what each capture loses, whole and in the box.
+Each capture has one imperfection, the last one all of them. With ``--mend`` there are other captures,
+predicted as given and as corrected automatically by ``ghgs predict``. Photographs have a background
+and twice the size of the model's input, and are processed like a user's (``Capture``): cropped to the
+subject. Targets are always those of the clean rig, so that a loss is due to the prediction. Prints
+PSNR of exact photographs and the loss of each capture, whole and in the box.
 """
 
 import argparse
@@ -47,7 +47,7 @@ _RING, _VIEWS = 16, 4
 _EVEN = even_positions(_RING, _VIEWS)
 _UNEVEN = [0, 5, 7, 12]
 _TARGETS = ("release", "midway")
-#: Sides of photographs over those of their crops. Limits in pixels are of the crops.
+#: Ratio of the sides of photographs and crops. Limits in pixels refer to crops.
 _LARGER = 2
 _PIXELS = ("mask_offset", "mask_ragged", "calibration")
 _HELD = {"camera_pitch": 6.0, "camera_roll": 8.0, "camera_look_at": 0.08}
@@ -58,13 +58,12 @@ _PIECES = {"mask_hole_chance": 1.0}
 
 @dataclass(frozen=True)
 class Imperfection:
-    """How a capture differs: ``data.rig.variation``, positions of the inputs,
-    and :class:`Augmentation`.
+    """Difference of a capture: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`.
 
-    Photographs have exact mattes, or ``masks`` of 0 and 1, ``grown`` pixels too large. A ``bumped``
-    camera is the only one whose calibration is wrong; None: all are. The first one is turned by
-    ``turned`` pixels, its focal length ``zoom`` times and its photograph's colours to the power
-    ``gamma`` of the right ones.
+    Photographs have exact mattes, or ``masks`` of 0 and 1, dilated by ``grown`` pixels. ``bumped``:
+    the only camera with a wrong calibration; None: all are wrong. The first camera is turned by
+    ``turned`` pixels, its focal length is multiplied by ``zoom``, and its colours are raised to the
+    power ``gamma``.
     """
 
     rig: Mapping[str, Any] = field(default_factory=dict)
@@ -78,7 +77,7 @@ class Imperfection:
     gamma: float = 1.0
 
 
-#: What ``--mend`` measures. Photographs are twice as large as crops, and so are their pixels.
+#: Captures of ``--mend``. Names count pixels of photographs, which are twice as large as crops.
 MENDED = {
     "exact": Imperfection(),
     "exact masks": Imperfection(masks=True),
@@ -116,9 +115,8 @@ CAPTURES = {
 def data_of(
     capture: Imperfection, people: int, size: list[int], uneven: list[int], rendered: list[int] | None = None
 ) -> PhotographsDataModule:
-    """People in front of the rig of a capture;
-    what is missing is rendered, in the ``rendered`` size."""
-    # Inputs, the targets beside the first one and half-way to the second one.
+    """People in front of a capture's rig; missing ones are rendered, in the ``rendered`` size."""
+    # Inputs, and targets next to the first one and half-way to the second one.
     positions = sorted({*_EVEN, *uneven, _EVEN[1] // 2})
     overrides = [
         "data=synthetic",
@@ -143,8 +141,7 @@ def batches(
     size: tuple[int, int],
     refine_masks: int,
 ) -> Iterator[Batch]:
-    """Crops of ``size`` of the photographs that ``capture`` takes,
-    with the targets of the clean rig."""
+    """Crops of ``size`` of the photographs of a capture, with the targets of the clean rig."""
     targets = [read_option("targets", name) for name in _TARGETS]
     for batch in clean.evaluation_loader(_VIEWS, targets, batch_size=1):
         subject = batch.subjects[0]
@@ -163,8 +160,7 @@ def predicted(
     renderer: Renderer,
     refine: int | str,
 ) -> Iterator[Batch]:
-    """The batch that ``predict`` takes for each person from the ``first`` on,
-    with the targets of the rig."""
+    """Batches after the preparation by ``predict``, from person ``first`` on, with the targets of the rig."""
     targets = [read_option("targets", name) for name in _TARGETS]
     clean, own = data
     for subject in list(clean.subjects("val"))[first:]:
@@ -180,7 +176,7 @@ def predicted(
 
 
 def photographed(capture: Imperfection, batch: Batch) -> Capture:
-    """One subject as a capture has it, from photographs of it on black: before a background."""
+    """Capture of one subject, composed with a background, from images on black."""
     subject = batch.subjects[0]
     limits = {k: v * (_LARGER if k in _PIXELS else 1) for k, v in capture.augmentation.items()}
     colors = Augmentation(**{k: v for k, v in limits.items() if k in _COLORS})
@@ -209,8 +205,7 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
 
 
 def _knock(lens: np.ndarray, pose: np.ndarray, capture: Imperfection, subject: str) -> None:
-    """Turn and zoom one camera in place, about an axis in its image plane that is the
-    subject's own."""
+    """Turn and zoom one camera in place, about an axis in its image plane that depends on the subject."""
     angle = subject_rng(2, subject).uniform(0, 2 * math.pi)
     turn = math.tan(_LARGER * capture.turned / lens[0, 0] / 2)
     rotation = torch.tensor([1.0, turn * math.cos(angle), turn * math.sin(angle), 0.0], dtype=torch.float64)
@@ -219,8 +214,7 @@ def _knock(lens: np.ndarray, pose: np.ndarray, capture: Imperfection, subject: s
 
 
 def means(rows: list[dict]) -> dict[str, float]:
-    """PSNR by target and region, and the error of depth where the method has one,
-    over the subjects."""
+    """PSNR by target and region, and the depth error where the method has one, over the subjects."""
     found = {
         f"{target}_{name}": sum(row[name] for row in rows if row["targets"] == target)
         / sum(row["targets"] == target for row in rows)
@@ -232,7 +226,7 @@ def means(rows: list[dict]) -> dict[str, float]:
 
 
 def table(results: Mapping[str, dict[str, float]]) -> str:
-    """The clean rig, and what each capture loses."""
+    """Format the clean rig, and the loss of each capture."""
     clean, single = results["clean"], [n for n in results if n not in ("clean", "all at once")]
     mean = {name: sum(results[n][name] for n in single) / len(single) for name in clean}
     lines = ["| capture | " + " | ".join(clean) + " |", "|---" * (len(clean) + 1) + "|"]
@@ -249,7 +243,7 @@ def table(results: Mapping[str, dict[str, float]]) -> str:
 def measure_mending(
     options: argparse.Namespace, size: tuple[int, int], run: Run, device: torch.device
 ) -> None:
-    """Print what captures lose as given, and what is left of it where ``predict`` decides."""
+    """Print the quality of captures as given and as corrected by ``predict``."""
     renderer, model = build_renderer(run, device), Predictor.from_checkpoint(options.checkpoint, device)
     metrics, larger = run.metrics.build().to(device), [_LARGER * side for side in size]
     data = tuple(data_of(Imperfection(), options.people, side, [], larger) for side in (list(size), larger))

@@ -1,12 +1,13 @@
-"""Work of a GPU by stage: calls, kernel launches (calls that are no views), device-to-host synchronisations.
+"""GPU work by stage: calls, kernel launches (calls other than views), device-to-host synchronisations.
 
-Counted on the pretend device of the tests, without a GPU. A GPU starves where calls are many and small, and
-it idles where the host waits for a value. A list that is copied to the device makes the host wait, too.
+Counted on the pretend device of the tests, without a GPU. A GPU idles between many small calls, and
+where the host waits for a value. Copying a list to the device synchronises, too.
 
     python benchmarks/device.py                          # vggt_nano, two elements of four views of 140 x 140
-    python benchmarks/device.py --lines model=paper      # which lines wait; with overrides of `ghgs train`
+    python benchmarks/device.py --lines model=paper      # lines that synchronise; with overrides of
+    `ghgs train`
 
-gsplat's kernels, which project and draw, are left out: a stand-in draws nothing.
+gsplat's kernels for projection and rasterization are excluded: a stand-in renders nothing.
 """
 
 import argparse
@@ -38,7 +39,7 @@ Counts = dict[str, tuple[int, int, int]]
 
 
 class CountingProbe(Watcher):
-    """Calls and waits of each stage."""
+    """Calls, launches and synchronisations of each stage."""
 
     def __init__(self, log: Log):
         self.log = log
@@ -63,7 +64,7 @@ class CountingProbe(Watcher):
 
 
 def forward(predictor: Predictor, batch: Batch, log: Log) -> Counts:
-    """Counts of one prediction without a gradient."""
+    """Counts of one prediction without gradients."""
     probe = CountingProbe(log)
     with torch.no_grad(), watched(predictor.model, probe), probe.of(TOTAL):
         predictor(batch)
@@ -74,7 +75,7 @@ def forward(predictor: Predictor, batch: Batch, log: Log) -> Counts:
 
 
 class Gsplat:
-    """A stand-in for gsplat that draws nothing: every splat touches a tile."""
+    """A stand-in for gsplat that renders nothing: every splat touches a tile."""
 
     __version__ = "1.5.3"
 
@@ -99,7 +100,7 @@ class Gsplat:
 
 @contextmanager
 def drawing_nothing() -> Iterator[None]:
-    """Rendering goes through the gsplat backend to a stand-in for gsplat."""
+    """Render through the gsplat backend with a stand-in for gsplat."""
     with (
         mock.patch.object(api, "resolve_backend", return_value="gsplat"),
         mock.patch.object(gsplat_backend, "load", return_value=Gsplat),
@@ -108,7 +109,7 @@ def drawing_nothing() -> Iterator[None]:
 
 
 def second_step(model: GHGS, options: Optimization, batch: Batch, log: Log) -> Counts:
-    """Counts of a training step without making the optimizer's state."""
+    """Counts of a training step without the creation of the optimizer's state."""
     optimizer = options.optimizer(model)
     step(model, options, optimizer, batch, log)
     optimizer.zero_grad()

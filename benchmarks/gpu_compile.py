@@ -1,9 +1,9 @@
-"""Compiles the kernels in Triton for GPUs on a machine without one, as a prediction and a step call them.
+"""Compile the Triton kernels on a machine without a GPU, for the calls of a prediction and a step.
 
     python benchmarks/gpu_compile.py          # for the compute capabilities 8.0, 8.6, 8.9 and 9.0
     python benchmarks/gpu_compile.py 90
 
-Says for each kernel and each GPU how many registers a thread needs, and how many bytes do not fit into them.
+Prints registers per thread and spilled bytes for each kernel and each GPU.
 """
 
 import argparse
@@ -49,7 +49,7 @@ TYPES = {
 
 
 class Compiler:
-    """Compiles a kernel instead of starting it, once for each GPU and each set of flags."""
+    """Compiles kernels instead of launching them, once for each GPU and each set of flags."""
 
     def __init__(self, capabilities: list[int]):
         self.capabilities = capabilities
@@ -78,7 +78,7 @@ class Compiler:
 
 
 def _type(value: Any) -> str:
-    """Triton's name of the type of an argument; None and 1 are compiled in."""
+    """Triton's name of the type of an argument; None and 1 are compile-time constants."""
     if isinstance(value, torch.Tensor):
         return TYPES[value.dtype]
     if value is None or (type(value) is int and value == 1):
@@ -87,7 +87,7 @@ def _type(value: Any) -> str:
 
 
 def _needs(compiled: Any) -> str:
-    """Registers of a thread, and bytes that did not fit into them."""
+    """Registers per thread, and spilled bytes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "kernel.ptx"
         path.write_text(compiled.asm["ptx"])
@@ -99,7 +99,7 @@ def _needs(compiled: Any) -> str:
 
 
 def compiled_too(operator: dispatch.Operator) -> Callable[..., Any]:
-    """An operator in plain PyTorch that calls its kernel, too."""
+    """An operator in plain PyTorch that also calls its kernel."""
 
     def call(*inputs):
         operator.kernels["cuda"](*inputs)
@@ -131,7 +131,7 @@ def main() -> None:
             prediction = model.train()(batch).gaussians
             sum(getattr(prediction, name).sum() for name in ("means", "scales", "colors")).backward()
         boxes = torch.rand(1, 9, 2)
-        for height, width in ((60, 75), (16, 75), (60, 16)):  # one tile is a constant
+        for height, width in ((60, 75), (16, 75), (60, 16)):  # a count of one tile is a compile-time constant
             intersections(boxes, boxes.ceil().int(), boxes[..., 0], height, width, 100)
 
 

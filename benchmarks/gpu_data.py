@@ -46,8 +46,8 @@ def loader(call: Call) -> None:
 
 
 def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:
-    """Samples per second, and how many samples were counted; the first batch, which starts the
-    processes, does not count."""
+    """Samples per second, and the number of counted samples; the first batch, which starts the
+    workers, is excluded."""
     batches = iter(data.train_dataloader())
     next(batches)
     started, samples = time.perf_counter(), 0
@@ -83,7 +83,7 @@ def training(call: Call) -> None:
 
 
 def validations(file: Path) -> list[dict[str, float]]:
-    """Scores of the validations in a run's CSV file, and the steps before each."""
+    """Scores of the validations in a run's CSV file, with their steps."""
     if not file.exists():
         return []
     with file.open(newline="") as lines:

@@ -1,4 +1,4 @@
-"""Compares replays of CUDA graphs with eager calls, for inputs that were not captured."""
+"""Compare replays of CUDA graphs with eager calls, for inputs that were not captured."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
@@ -12,41 +12,44 @@ from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.types import Batch
 
-#: Largest distance of two results that differ by rounding, besides ten times that of two eager calls.
+#: Largest distance of results that differ by rounding; or ten times that of two eager calls, if larger.
 ROUNDING = 1e-3
 WRONG = "WRONG"
 
 
 def other_scene(batch: Batch) -> Batch:
-    """A batch of the same shape bucket, with other colours, in a world that is moved by 20 cm."""
+    """A batch of the same shape bucket, with other colours, in a world that is shifted by 20 cm."""
     extrinsics = batch.cameras.extrinsics.clone()
     extrinsics[..., :3, 3] += 0.2 * extrinsics[..., :3, 0]
     return replace(batch, images=0.6 * batch.images, cameras=replace(batch.cameras, extrinsics=extrinsics))
 
 
 def apart(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
-    """Largest distance of a tensor from another, as a share of the other's norm, or of a thousandth of
-    the largest norm: small gradients are rounding alone."""
+    """Largest relative distance between tensors.
+
+    Each is relative to the norm of the wanted tensor, or to a thousandth of the largest norm: small
+    gradients are only rounding errors.
+    """
     sizes = [other.norm().item() for other in wanted]
     least = 1e-3 * max(sizes)
     distances = [(one - other).norm() for one, other in zip(found, wanted, strict=True)]
     shares = [distance / max(size, least) for distance, size in zip(distances, sizes, strict=True)]
-    return float(torch.stack(shares).max())  # a nan stays
+    return float(torch.stack(shares).max())  # nan propagates
 
 
 def judged(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[Tensor]]) -> None:
-    """Row of a replayed call, compared with two eager ones.
+    """Add a row that compares a replayed call with two eager ones.
 
     Args:
         call: of the section.
         name: of the row.
-        cache: that has captured calls of this bucket.
-        run: gives the results on the CPU, of a call that may be replayed (True) or is eager.
+        cache: graph cache with captured calls of this shape bucket.
+        run: returns results on the CPU of a call that may be replayed (True) or is eager (False).
     """
     before = cache.counts["replayed"]
     found, wanted, again = (run(may_replay) for may_replay in (True, False, False))
     numbers = {"apart": apart(found, wanted), "noise": apart(again, wanted)}
-    # A number that is none is no small one.
+    # False for nan.
     holds = numbers["apart"] <= max(ROUNDING, 10 * numbers["noise"])
     is_replayed = cache.counts["replayed"] > before
     verdict = ("as eager" if holds else WRONG) if is_replayed else "not replayed"
@@ -60,12 +63,12 @@ def here(tensors: Iterable[Tensor]) -> list[Tensor]:
 
 @torch.no_grad()
 def judge_prediction(call: Call, name: str, predictor: Predictor, batch: Batch) -> None:
-    """Row of a prediction of another scene.
+    """Add a row for a prediction of another scene.
 
     Args:
         call: of the section.
         name: of the row.
-        predictor: that has captured predictions of this bucket.
+        predictor: with captured predictions of this shape bucket.
         batch: of the shape bucket, on the device.
     """
     other, options = other_scene(batch), predictor.options
@@ -82,12 +85,12 @@ def judge_prediction(call: Call, name: str, predictor: Predictor, batch: Batch) 
 
 
 def judge_step(call: Call, name: str, step: Any) -> None:
-    """Row of the loss and the gradients of a step on another scene.
+    """Add a row for the loss and the gradients of a step on another scene.
 
     Args:
         call: of the section.
         name: of the row.
-        step: of :mod:`benchmarks.gpu_sections`, which has captured steps of this shape bucket.
+        step: of :mod:`benchmarks.gpu_sections`, with captured steps of this shape bucket.
     """
     batch, step.host = step.host, other_scene(step.host)
     step.data()
@@ -105,7 +108,7 @@ def judge_step(call: Call, name: str, step: Any) -> None:
 
 @torch.no_grad()
 def judge_optimizer(call: Call, name: str, step: Any) -> None:
-    """Row of what the captured step of the optimizer changes, along other gradients.
+    """Add a row for the changes of a captured optimizer step, with other gradients.
 
     Args:
         call: of the section.

@@ -1,18 +1,19 @@
-"""Each camera of a rig held out over a sequence, predicted from the others.
+"""Predict each camera of a rig from the others, over a sequence, and compare with its photographs.
 
     python benchmarks/held_out_sequence.py photographs cameras.json --out held_out_sequence --step 5 \\
         --adapted odd.ckpt even.ckpt
 
-Cameras are corrected with all photographs (the calibration is theirs), once, as `ghgs predict`
-does; so are colour gains, with a mean of 1 over those that predict. All ways are measured against
-the same masks: those of the sequence, cut anew where they fail. Photographs whose mask still fails, by
-the hull of the others or by the background (`is_contradicted`), are counted and not measured. Prints
-over all instants and cameras PSNR of the photograph on black, whole and in the box of the subject;
-there of images scaled to one brightness; and there of the photograph as it is, the render before the
-background, which asks no mask; CPU seconds of an instant without the rig's. What is
-done stays in --out, and is not done again: a run that was stopped goes on. Each instant is said, and in
---out/results.json at once. Weights that learned from the odd instants predict the even ones, and
-the other way round: `--adapted odd.ckpt even.ckpt`.
+Cameras are corrected once with all photographs (the calibration is theirs), as in `ghgs predict`; so
+are colour gains, with a mean of 1 over the predicting cameras. All ways are compared with the same
+masks: those of the sequence, recut where they fail. Photographs whose mask still fails, by the hull
+of the others or by the background (`is_contradicted`), are counted but not measured.
+
+Prints means over all instants and cameras: PSNR of the photograph on black, whole and in the box of
+the subject; in the box after scaling both images to one brightness; in the box of the original
+photograph against the render on the background, which needs no mask; and CPU seconds of an instant
+without those of the rig. Intermediate results are cached in --out, so that a stopped run continues;
+each instant is logged and written to --out/results.json immediately. `--adapted odd.ckpt even.ckpt`:
+weights adapted on the odd instants predict the even ones, and vice versa.
 """
 
 import argparse
@@ -49,7 +50,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras
 from ghgs_lit.weights.checkpoint import read_config
 
-#: Which masks, cameras and colour gains, and whose weights.
+#: Masks, cameras, colour gains and weights of each way.
 WAYS = {
     "as given": ("given", "given", "each", "shipped"),
     "auto": ("mended", "once", "once", "shipped"),
@@ -57,20 +58,20 @@ WAYS = {
 }
 COLUMNS = ("whole", "box", "box_40", "photograph", "seconds")
 BOX = COLUMNS.index("box")
-#: Levels of 255 below which a pixel shows the background, and above which it does not.
+#: Differences (of 255 levels) from the background below which a pixel shows it, and above which not.
 SAME, DIFFERENT = 8, 40
 
 
 class Measured:
-    """A sequence, and what was found of it so far.
+    """A sequence and its results so far.
 
     Args:
         images: folder with a folder for each instant.
         cameras: the calibration.
-        out: folder of what is done; gets ``results.json`` after each instant.
-        step: every how many instants one is measured.
-        weights: files of weights by name, ``shipped`` first; of several the instant of number i in
-            the sequence is predicted by the one of number i modulo their count.
+        out: cache of intermediate results; ``results.json`` is updated after each instant.
+        step: measure every ``step``-th instant.
+        weights: files of weights by name, ``shipped`` first; of n files, instant i of the sequence is
+            predicted by file i modulo n.
     """
 
     def __init__(self, images: Path, cameras: Path, out: Path, step: int, weights: dict[str, list[str]]):
@@ -93,8 +94,7 @@ class Measured:
         return torch.load(path, weights_only=False)
 
     def say(self, way: str, subject: str, rows: Sequence[Sequence[float]]) -> None:
-        """Keep the columns of all cameras of an instant or a person in the JSON;
-        print the box's."""
+        """Store the results of all cameras of an instant in the JSON file; log the box's PSNR."""
         columns = (dict(zip(COLUMNS, row, strict=True)) for row in rows)
         self.results["rows"].setdefault(way, {})[subject] = dict(zip(self.cameras, columns, strict=True))
         write_text_atomically(self.out / "results.json", json.dumps(self.results, indent=1))
@@ -126,7 +126,7 @@ class Measured:
         return found, lenses, time.process_time() - begin
 
     def truth(self, name: str) -> list[dict[str, Any]]:
-        """Of each camera: photographs on black and as they are, verified masks, halved."""
+        """Per camera: the photograph on black and the original, and the verified mask, at half size."""
         backgrounds = self.shared[0]
         capture = backgrounds.applied(Capture(name, self.folder.photographs(name)))
         small = tuple(shrunk(p, backgrounds.factors[p.name]) for p in capture.photographs)
@@ -142,8 +142,11 @@ class Measured:
 
     @torch.no_grad()
     def drawn(self, way: str, name: str, view: int) -> tuple[Tensor, float]:
-        """A held-out camera: colours and alpha [4, h, w] of the photograph's half size as bytes,
-        and CPU seconds."""
+        """Render a held-out camera.
+
+        Returns:
+            Colours and alpha [4, h, w] at half the photograph's size, uint8, and CPU seconds.
+        """
         masks, cameras, gains, weights = WAYS[way]
         rig = self.shared[1]
         truth = self.kept(f"truth_{name}", partial(self.truth, name))[view]
@@ -160,7 +163,7 @@ class Measured:
         return (255 * image).round().byte(), seconds
 
     def rows(self, way: str) -> np.ndarray:
-        """The columns [cameras, n, 5] of each camera held out; ``black`` draws nothing."""
+        """The columns [cameras, n, 5] of each held-out camera; the way ``black`` renders nothing."""
         found: list[list[list[float]]] = []
         for name in self.names:
             found.append([])
@@ -178,12 +181,14 @@ class Measured:
 
 
 def is_contradicted(photograph: Photograph, behind: Background, inside: np.ndarray) -> bool:
-    """Whether a mask shows the background, or lacks what differs from it inside the others' hull, in
-    thick parts of more than ``MISSED`` of its area: the hull alone passes half a head.
+    """Whether the background contradicts a mask, in thick parts of more than ``MISSED`` of its area.
+
+    Such parts show the background inside the mask, or differ from it outside the mask but inside the
+    others' hull. The hull alone does not detect half a missing head.
 
     Args:
         photograph: of the background's size.
-        inside: pixels by which each pixel lies inside the hull of the other masks [h, w].
+        inside: depth in pixels of each pixel inside the hull of the other masks [h, w].
     """
     mask = photograph.mask
     off = ndimage.uniform_filter(np.abs(photograph.image - behind.image).max(-1), 3)
@@ -195,8 +200,7 @@ def is_contradicted(photograph: Photograph, behind: Background, inside: np.ndarr
 
 
 def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
-    """Photographs divided by the rig's gains, whose mean over these cameras is 1; as they are where
-    it has none."""
+    """Divide images by the rig's gains, with a mean of 1 over these cameras; unchanged without gains."""
     if not rig or not rig.gains:
         return batch
     logs = np.log([rig.gains[name] for name in batch.views[0]])
@@ -204,7 +208,7 @@ def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
 
 
 def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[float]:
-    """PSNR of four kinds, nan where the mask fails."""
+    """PSNR of four kinds in dB, nan where the mask fails."""
     composed = image + (1 - alpha) * truth["behind"]
     off = (composed - truth["photograph"]) * truth["known"]
     box = box_of(truth["mask"][None])
@@ -270,7 +274,7 @@ def main() -> None:
 
 
 def line(name: str, rows: np.ndarray) -> str:
-    """Means over instants and cameras, and of the box by camera."""
+    """Format means over instants and cameras, and the box's PSNR by camera."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # columns without a value
         means = " | ".join(f"{value:.2f}" for value in np.nanmean(rows, (0, 1)))

@@ -1,8 +1,8 @@
-"""Photographs of a person to a splat.
+"""Convert photographs of a person to a splat.
 
     python photographs_to_splat.py photographs cameras.json model.ckpt splat.ply
 
-Masks lie beside the photographs (``front_mask.png`` of ``front.jpg``), or are their alpha channels.
+Masks are next to the photographs (``front_mask.png`` for ``front.jpg``), or are their alpha channels.
 """
 
 import sys

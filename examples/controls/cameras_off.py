@@ -1,10 +1,10 @@
-"""Measure the runs of a sweep again, their input cameras off by up to some pixels; the targets stay true.
+"""Measure the runs of a sweep again, with errors of some pixels in the input cameras but exact targets.
 
     export GHGS_PLUGINS=examples/controls/controls.py
     python examples/controls/cameras_off.py runs/train/controls runs/controls_off --pixels 3
     ghgs table runs=runs/controls_off
 
-A person's cameras are the same in all runs. Runs that are measured already are not measured again.
+A person's cameras are the same in all runs. Runs with results are skipped.
 """
 
 import argparse
@@ -28,8 +28,8 @@ def measure_run(checkpoint: Path, directory: Path, pixels: float) -> None:
 
     Args:
         checkpoint: Of a training with true depths.
-        directory: Where results go.
-        pixels: Greatest error of a camera in pixels of the photographs, above 0.
+        directory: Folder of the results.
+        pixels: Largest error of a camera in pixels of the images, above 0.
     """
     keys = [f"checkpoint={checkpoint}", "metrics.lpips=off", "evaluation.pictures=0", "device=cpu"]
     run = inputs.with_chosen_targets(inputs.with_trained_data(run_of("evaluate", keys)))

@@ -1,12 +1,11 @@
-"""Recalibration with controls: can this experiment see what 3D neighbours and semantic
-consistency do?
+"""Recalibration with controls: can an experiment detect effects of 3D neighbours and semantic consistency?
 
     export GHGS_PLUGINS=examples/controls/controls.py
     ghgs train --config-dir examples/controls/conf sweep=controls
 
-Rows of the ablation can be told apart only where a row that must lose loses, and one that must win
-wins. Both read what a prediction cannot know (true depths and bodies of built-in people), so they
-are a plug-in and no options of the package: nobody meets them by accident.
+An ablation can only separate its rows if a row that must lose loses, and one that must win wins. Both
+use ground truth (depths and bodies of built-in people), so they are a plug-in, which nobody enables
+by accident, and not options of the package.
 """
 
 import dataclasses
@@ -24,21 +23,19 @@ from ghgs_lit.method.recalibration import Recalibration, RecalibrationOptions
 from ghgs_lit.training.pretext import part_shares
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
-#: A residual of this length, in metres, is a value of 1 in the tokens,
-#: whose channels are of that order.
+#: Residual in metres that becomes a value of 1 in the tokens, whose channels are of that order.
 RESIDUAL_UNIT = 0.05
-#: Channels of a token that hold the residual: its three coordinates, eight times.
+#: Repetitions of the residual's three coordinates in the channels of a token.
 COPIES = 8
 
 
 @dataclass(frozen=True)
 class KnownPoints(Points):
-    """Points with what is true of their tokens.
+    """Points with ground truth of their tokens.
 
     Attributes:
-        residual: from the point of a token to where the photographed surface is, in metres;
-            0 if unknown.
-        shares: of the parts of the body in the patch of a token.
+        residual: from the point of a token to the true surface, in metres; 0 if unknown.
+        shares: shares of body parts in the patch of a token.
     """
 
     residual: Float[Tensor, "N 3"]
@@ -47,7 +44,7 @@ class KnownPoints(Points):
 
 @register("unprojection", "known")
 class KnownUnprojection(Unprojection):
-    """As in the package, with the truth beside it."""
+    """The package's unprojection, with ground truth in addition."""
 
     def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> KnownPoints:
         """Points of pixels and tokens.
@@ -55,10 +52,10 @@ class KnownUnprojection(Unprojection):
         Args:
             depth_maps: as predicted.
             tokens: of the encoder.
-            batch: with true depths and bodies in the cameras' world, which the stages must share.
+            batch: with true depths and bodies in the world frame of the cameras, which all stages must share.
 
         Raises:
-            InputError: the data knows no depths or no bodies.
+            InputError: the data has no depths or no bodies.
         """
         require(batch.depths is not None, "loss", "loss=depth, with which true depths are read", "none")
         points = super().__call__(depth_maps, tokens, batch)
@@ -75,38 +72,36 @@ class KnownUnprojection(Unprojection):
 
 @register("recalibration", "control")
 class ControlOptions(RecalibrationOptions):
-    """The recalibration of the package on features that know parts,
-    and what must lose or win after it."""
+    """The package's recalibration with ground-truth part features, followed by a control."""
 
     control: Literal["none", "shuffled", "residual"] = "none"
-    """What is done to recalibrated tokens: none | shuffled: the tokens of a subject change
-    places (must lose)
-    | residual: some channels say how far the token's point is from the true surface (must win)"""
+    """Change of recalibrated tokens: none | shuffled: the tokens of a subject are permuted (must lose)
+    | residual: some channels are the residual from the token's point to the true surface (must win)"""
 
     def build(self, dim_latent: int) -> "Control":
         return Control(self, dim_latent)
 
 
 class Control(Recalibration):
-    """:class:`Recalibration` whose semantic features are roots of true shares of parts.
+    """:class:`Recalibration` whose semantic features are square roots of true shares of parts.
 
-    Their cosine is the overlap of two distributions, as that of a trained branch: the most similar
-    patch of another view shows the same part in 80 % of the cases.
+    Their cosine is the overlap of two distributions, similar to that of a trained branch: the most
+    similar patch of another view shows the same part in 80 % of the cases.
     """
 
     def __init__(self, options: ControlOptions, dim_latent: int):
         super().__init__(options, dim_latent)
         self.control = options.control
-        # a hook: pictures of attention see these features, too
+        # a hook, so that visualizations of attention use these features, too
         self.register_forward_pre_hook(_with_parts)
 
     def forward(self, tokens: Tokens, points: KnownPoints, plan) -> Tokens:
-        """Recalibrated tokens, changed as ``control`` says.
+        """Recalibrate tokens, then change them as ``control`` specifies.
 
         Args:
-            tokens: of the encoder, with features that know parts.
+            tokens: of the encoder, with part features.
             points: of :class:`KnownUnprojection`.
-            plan: as of :class:`Recalibration`.
+            plan: as in :class:`Recalibration`.
         """
         tokens = super().forward(tokens, points, plan)
         change = {"none": _unchanged, "shuffled": _shuffled, "residual": _with_residual}[self.control]
@@ -114,7 +109,7 @@ class Control(Recalibration):
 
 
 def _with_parts(stage: Control, inputs: tuple) -> tuple:
-    """Inputs of the stage with features that know parts."""
+    """Inputs of the stage with part features."""
     tokens, points, plan = inputs
     expected = "kind: known, which tells this recalibration what is true"
     require(isinstance(points, KnownPoints), "unprojection", expected, type(points).__name__)
@@ -126,7 +121,7 @@ def _unchanged(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N
 
 
 def _shuffled(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
-    """Tokens of each subject in a random order, the same in all layers and in all runs."""
+    """Permute the tokens of each subject, equally in all layers and all runs."""
     element = tokens.image // tokens.grid[1]
     order = torch.arange(len(element), device=element.device)
     for number in range(tokens.grid[0]):
@@ -137,7 +132,7 @@ def _shuffled(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"
 
 
 def _with_residual(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
-    """Tokens whose first channels are the true residual."""
+    """Replace the first channels of tokens by the true residual."""
     said = (points.residual / RESIDUAL_UNIT).repeat(1, COPIES)
     layers = []
     for layer in tokens.latent:

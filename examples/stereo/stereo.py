@@ -3,12 +3,12 @@
     export GHGS_PLUGINS=examples/stereo/stereo.py
     ghgs train --config-dir examples/stereo/conf model=gps
 
-After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): one small network
-computes features of all views; they are correlated along epipolar lines; a GRU updates the estimate
-a few times from the correlations around it (RAFT-Stereo, Lipson et al., 3DV 2021); upsampling is
-convex (RAFT, Teed and Deng, ECCV 2020). Unlike there, photographs are not rectified: equal steps of
-inverse depth are the equal steps of disparity of a rectified pair. The two pairs of a view give one
-depth, and the loss sees the last update only.
+It follows the published description of GPS-Gaussian (Zheng et al., CVPR 2024): one small network
+computes features of all views; they are correlated along epipolar lines; a GRU updates the estimate a
+few times from the correlations around it (RAFT-Stereo, Lipson et al., 3DV 2021); upsampling is convex
+(RAFT, Teed and Deng, ECCV 2020). In contrast to it, images are not rectified: equal steps of inverse
+depth are the equal steps of disparity of a rectified pair. The two pairs of a view give one depth,
+and only the last update contributes to the loss.
 """
 
 import torch
@@ -34,8 +34,7 @@ CELL = 4
 CHANNELS = 32
 #: Number of neighbouring views that each view is paired with.
 PAIRS = 2
-#: Resolutions of the correlations along depth, each half of the one before,
-#: and steps to either side.
+#: Resolutions of the correlations along depth, each half of the previous one; steps to either side.
 LEVELS = 3
 RADIUS = 4
 
@@ -44,17 +43,16 @@ _inverse = BOUNDED["bounded_inverse"]
 
 @register("depth_head", "stereo")
 class StereoHeadOptions(Options):
-    """Photographs to one depth for each pixel, by stereo between neighbouring views."""
+    """Images to one depth for each pixel, by stereo between neighbouring views."""
 
     group = "depth_head"
     consistency_depths: int = Field(48, gt=0, le=4096, multiple_of=2 ** (LEVELS - 1))
-    """Inverse depths from near to far at which neighbouring views are correlated."""
+    """Number of inverse depths from near to far at which neighbouring views are correlated"""
     updates: int = Field(3, ge=1, le=64)
-    """Updates of the inverse depth by the GRU;
-    3 as published, and no stereo method takes more than 64."""
+    """Number of GRU updates of the inverse depth; 3 as published, and no stereo method uses more than 64"""
 
     def build(self, dim_latent: int) -> "StereoHead":
-        """The stage; it reads no tokens."""
+        """Build the stage, which uses no tokens."""
         return StereoHead(self)
 
 
@@ -83,13 +81,13 @@ class StereoHead(nn.Module):
         """Depths of all pixels between the nearest and the farthest bound of their view.
 
         Args:
-            tokens: not read.
-            batch: photographs, masks and cameras are read.
+            tokens: not used.
+            batch: images, masks and cameras are read.
             bounds: in metres.
-            plan: not read.
+            plan: not used.
 
         Returns:
-            Depths in metres, of which the subject's are valid, with confidences of 1.
+            Depths in metres, valid inside the subject, with confidences of 1.
         """
         height, width = batch.masks.shape[2:]
         near, far = subject_range(bounds, batch)
@@ -99,7 +97,7 @@ class StereoHead(nn.Module):
         return finite_maps(depth, batch, torch.ones_like(depth), bounds)
 
     def _fraction(self, batch: Batch, near: Tensor, far: Tensor) -> Float[Tensor, "n h w"]:
-        """Depth of each pixel as a share of the way from near to far; padded to whole cells."""
+        """Position of each pixel's depth between near (0) and far (1), padded to whole cells."""
         images = torch.cat((surface_colors(batch), coverage(batch)[:, :, None]), 2)
         images = F.pad(images, (0, -images.shape[-1] % CELL, 0, -images.shape[-2] % CELL))
         maps = self.features(images.flatten(0, 1).nan_to_num().to(self.features[0].weight.dtype))
@@ -122,11 +120,11 @@ class StereoHead(nn.Module):
 
 
 def _most_cells(batch: Batch, count: int) -> int:
-    """The number of cells that the subjects touch, or more, without a wait.
+    """Upper bound of the number of cells with a pixel of a subject, without a synchronisation.
 
     Args:
-        batch: extents of its masks are known; mattes may go beyond them.
-        count: of all cells.
+        batch: with cached extents of its masks; mattes may extend beyond them.
+        count: number of all cells.
     """
     if batch.alpha is not None:
         return count
@@ -138,8 +136,7 @@ def _two_layers(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Update(nn.Module):
-    """One update: correlations around the estimate, a convolutional GRU,
-    a change of the estimate."""
+    """One update: correlations around the estimate, a convolutional GRU, a change of the estimate."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -160,10 +157,10 @@ class Update(nn.Module):
         """The next memory, and the change of the raw estimate.
 
         Args:
-            memory: of the GRU, from -1 to 1.
-            context: features of the view itself.
+            memory: of the GRU, in [-1, 1].
+            context: features of the view.
             levels: correlations from near to far, from fine to coarse.
-            fraction: the estimate, as a share of the way from near to far.
+            fraction: the estimate, 0 at near and 1 at far.
         """
         seen = torch.cat([*(look_up(level, fraction) for level in levels), 2 * fraction - 1], 1)
         x = torch.cat((self.seen(seen.to(memory.dtype)).relu(), context), 1)
@@ -180,8 +177,7 @@ class Update(nn.Module):
 def subject_range(
     bounds: DepthBounds, batch: Batch
 ) -> tuple[Float[Tensor, "B V 1 1"], Float[Tensor, "B V 1 1"]]:
-    """The nearest and the farthest bound of the subject's pixels in each view;
-    of all pixels if none.
+    """The nearest and the farthest bound of the subject's pixels in each view; of all pixels if it has none.
 
     Args:
         bounds: of all pixels, in metres.
@@ -198,15 +194,13 @@ def subject_range(
 
 
 def neighboring_views(cameras: Cameras) -> Int[Tensor, "n p"]:
-    """For each image ``b * V + v``, the images whose optical axes have the smallest
-    angles to its own.
+    """For each image ``b * V + v``, the images with the smallest angles between optical axes.
 
     Args:
         cameras: [B, V].
 
     Returns:
-        Their numbers, also ``b * V + v``: of :data:`PAIRS` images,
-        or of all others if these are fewer.
+        Indices ``b * V + v`` of :data:`PAIRS` images, or of all others if there are fewer.
     """
     count, views = cameras.shape
     forward = at_least_float32(cameras.extrinsics)[..., 2, :3]
@@ -224,16 +218,15 @@ def correlations(
     far: Float[Tensor, "B V 1 1"],
     steps: int,
 ) -> Float[Tensor, "N S"]:
-    """Products of the features of cells with those of neighbouring views at S depths,
-    over ``sqrt(c)``.
+    """Products of features of cells and of neighbouring views at S depths, divided by ``sqrt(c)``.
 
-    The larger one of the two neighbours, as a surface is often hidden from one; 0 if the point lies
-    behind both or outside their images.
+    The larger one of the two neighbours counts, because a surface is often occluded in one; 0 if the
+    point is behind both or outside their images.
 
     Args:
         features: of cells, float32 or wider.
         cameras: [B, V], of images whose pixels are the cells.
-        cells: indices among those of all images.
+        cells: flat indices among the cells of all images.
         near: in metres.
         far: in metres.
         steps: S; depths have equal steps of inverse depth from near to far.
@@ -260,8 +253,8 @@ def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"])
     """Values at the estimate and at :data:`RADIUS` steps to either side, interpolated linearly.
 
     Args:
-        level: values at equal steps from near to far; the first and the last continue beyond.
-        fraction: the estimate, as a share of the way from near to far.
+        level: values at equal steps from near to far; constant beyond.
+        fraction: the estimate, 0 at near and 1 at far.
 
     Returns:
         ``2 * RADIUS + 1`` values of each cell.
@@ -274,10 +267,10 @@ def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"])
 
 
 def upsampled(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
-    """Maps at :data:`CELL` times the resolution.
+    """Upsample maps to :data:`CELL` times their resolution.
 
-    Each pixel is a convex combination of the 3 x 3 cells around its own; cells beyond the border
-    repeat it (RAFT, Teed and Deng, ECCV 2020).
+    Each pixel is a convex combination of the 3 x 3 cells around its cell, with replicated borders
+    (RAFT, Teed and Deng, ECCV 2020).
 
     Args:
         maps: of cells.
