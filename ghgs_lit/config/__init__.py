@@ -1,4 +1,4 @@
-"""The configuration: where its files are, how it is composed, and how objects are built from it."""
+"""Configuration: find and compose its files, and build objects from it."""
 
 from ghgs_lit.config.compose import compose, run_of
 from ghgs_lit.config.folder import VERSION_BASE, conf_dir

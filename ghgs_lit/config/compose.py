@@ -1,4 +1,4 @@
-"""Find and compose the Hydra configuration of a verb, and turn it into plain data."""
+"""Find and compose the Hydra configuration of a verb, and convert it to plain data."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,13 +22,13 @@ from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 
-#: First line of the configuration that a run saves; a file without it belongs to another program.
+#: First line of saved configurations; a file without it belongs to another program.
 HEADER = "# The configuration of this run, by ghgs."
 
 
 @contextmanager
 def _application() -> Iterator[None]:
-    """A Hydra application over ``conf``; one that runs already is put aside meanwhile."""
+    """Hydra application over ``conf``; an application that is already running is suspended meanwhile."""
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
     try:
@@ -39,8 +39,7 @@ def _application() -> Iterator[None]:
 
 
 def _is_own() -> bool:
-    """Whether the Hydra application that runs, if any, searches ``conf``:
-    another program's does not."""
+    """Whether the running Hydra application, if any, searches ``conf``; those of other programs do not."""
     if not GlobalHydra.instance().is_initialized():
         return False
     searched = GlobalHydra.instance().config_loader().get_search_path().get_path()
@@ -48,13 +47,13 @@ def _is_own() -> bool:
 
 
 def store_defaults(verb: str, folder: str | None = None) -> None:
-    """Register the configuration of a plug-in's verb with Hydra: its keys, at their defaults.
+    """Register the configuration of a plug-in's verb with Hydra: its keys with their defaults.
 
-    A file ``<verb>.yaml`` in ``--config-dir`` takes its place, and may add groups.
+    A file ``<verb>.yaml`` in ``--config-dir`` replaces it, and may add groups.
 
     Args:
-        verb: name of any verb; those of ``conf`` are left as they are.
-        folder: of ``--config-dir``, if any.
+        verb: Name of any verb; those with a file in ``conf`` are left unchanged.
+        folder: Value of ``--config-dir``, if any.
     """
     store = ConfigStore.instance()
     store.repo.pop(f"{verb}.yaml", None)  # Hydra rejects a file of the same name
@@ -71,18 +70,18 @@ def compose(
     folder: str | None = None,
     is_filled: bool = True,
 ) -> DictConfig:
-    """The configuration of ``ghgs <verb> <overrides>``, with all defaults.
+    """Compose the configuration of ``ghgs <verb> <overrides>``, with all defaults.
 
     Args:
-        verb: name of a verb, or of another file in ``conf``.
-        overrides: as on the command line, such as ``model=paper``.
-        with_hydra: whether the node ``hydra`` is part of it.
-        folder: of ``--config-dir``, if any.
-        is_filled: whether nodes have the defaults of their classes, which are imported then.
+        verb: Name of a verb, or of another file in ``conf``.
+        overrides: As on the command line, such as ``model=paper``.
+        with_hydra: Whether to include the node ``hydra``.
+        folder: Value of ``--config-dir``, if any.
+        is_filled: Whether to fill in the defaults of option nodes, which imports their classes.
 
     Raises:
-        HydraException: an override does not fit.
-        InputError: a node names an unknown kind.
+        HydraException: An override does not fit.
+        InputError: A node has an unknown kind.
     """
     if verb in verbs():
         store_defaults(verb, folder)
@@ -95,33 +94,33 @@ def compose(
 
 
 def saved_text(config: dict[str, Any]) -> str:
-    """YAML text of a resolved configuration, as runs save it."""
+    """YAML text of a resolved configuration in the form that runs save."""
     return f"{HEADER}\n{OmegaConf.to_yaml(OmegaConf.create(config))}"
 
 
 def run_of(verb: str, overrides: Sequence[str] = ()) -> Run:
-    """The run of ``ghgs <verb> <overrides>``: a verb's class with all of its keys and groups.
+    """Run of ``ghgs <verb> <overrides>``: an instance of the verb's class with all keys and groups.
 
     Args:
-        verb: name of a verb.
-        overrides: as for :func:`compose`.
+        verb: Name of a verb.
+        overrides: See :func:`compose`.
 
     Raises:
-        HydraException: an override does not fit.
-        InputError: a value is missing or has a wrong type or range.
+        HydraException: An override does not fit.
+        InputError: A value is missing or has a wrong type or range.
     """
     return verb_class(verb).of(plain(compose(verb, overrides)))
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
-    """A composed configuration as plain data that nothing has checked, groups first.
+    """Convert a composed configuration to plain data, groups first, without validation.
 
     Raises:
-        InputError: a value is missing.
+        InputError: A value is missing.
     """
     try:
         missing = sorted(OmegaConf.missing_keys(cfg))
-    except InterpolationResolutionError:  # perhaps of a key that has only a default
+    except InterpolationResolutionError:  # it may refer to a key that has only a default
         missing = sorted(OmegaConf.missing_keys(fill(cfg)))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
@@ -129,21 +128,20 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     return {group: config[group] for group in KINDS if group in config} | config
 
 
-#: Groups whose files set keys of the whole configuration.
+#: Groups whose files set keys of the whole configuration (``@package _global_``).
 _GLOBAL = ("experiment", "sweep", "ablation")
 
 
 def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
-    """Check that each key that the chosen ablation sets has its value,
-    unless the command line sets it.
+    """Check that each key set by the chosen ablation has its value, unless the command line sets it.
 
     Args:
-        cfg: the composed configuration.
-        hydra_node: the node ``hydra`` of the application that composed it.
+        cfg: Composed configuration.
+        hydra_node: Node ``hydra`` of the application that composed it.
 
     Raises:
-        InputError: a key has another value, or a file that sets keys of the whole configuration
-            lacks its line ``@package``.
+        InputError: A key has another value, or a file that sets keys of the whole configuration lacks its
+            ``@package`` line.
     """
     for group in _GLOBAL:
         if group in cfg:
@@ -152,7 +150,7 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
     name = hydra_node.runtime.choices.get("ablation")
     wanted = _set_by_ablation(name)
     composed = OmegaConf.to_container(cfg)
-    # with interpolations as they were typed
+    # with interpolations as typed
     overrides = OmegaConf.to_container(hydra_node.overrides.task)
     given = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
     for key, value in wanted.items():
@@ -162,11 +160,7 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
 
 
 def _set_by_ablation(name: str | None) -> dict[str, Any]:
-    """Dotted keys that an option of the group ``ablation`` sets, with its values.
-
-    Args:
-        name: of the option; None: no option, which sets nothing.
-    """
+    """Dotted keys set by an option of the group ``ablation``, with its values; empty for None."""
     if name is None:
         return {}
     file = GlobalHydra.instance().config_loader().repository.load_config(f"ablation/{name}")
@@ -175,15 +169,15 @@ def _set_by_ablation(name: str | None) -> dict[str, Any]:
 
 
 def chosen_options(config: Mapping[str, Any], hydra_node: DictConfig) -> dict[str, Any]:
-    """What tables call a run by, for the key ``chosen`` of its configuration.
+    """Names by which tables identify a run, for the key ``chosen`` of its configuration.
 
     Args:
         config: Resolved configuration of a training.
-        hydra_node: The node ``hydra`` of the application that composed it.
+        hydra_node: Node ``hydra`` of the application that composed it.
 
     Returns:
-        ``model``, ``encoder`` and ``ablation``: names of the chosen options, None without one;
-        ``sets``: dotted keys that the ablation sets, with their values in ``config``.
+        ``model``, ``encoder`` and ``ablation``: names of the chosen options, or None; ``sets``: dotted
+            keys set by the ablation, with their values in ``config``.
     """
     choices = hydra_node.runtime.choices
     names = {group: choices.get(group) for group in ("model", "encoder", "ablation")}
@@ -194,31 +188,30 @@ def read_options(group: str, names: Sequence[str], run: Run, key: str) -> dict[s
     """Options of a group by name.
 
     Args:
-        group: name of the group, such as ``skip``.
-        names: of the options.
-        run: the option that its node of the group names has these values instead of
-            those of its file.
-        key: begins the message of an error.
+        group: Name of the group, such as ``skip``.
+        names: Names of the options.
+        run: The option chosen in this run has the run's values instead of those of its file.
+        key: Start of error messages.
 
     Raises:
-        InputError: the group has no such option.
+        InputError: The group has no such option.
     """
     chosen = getattr(run, group).name
     return {name: run.plain[group] if name == chosen else read_option(group, name, key) for name in names}
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
-    """The values of ``<group>/<name>.yaml``, including its list of defaults, as plain data.
+    """Values of ``<group>/<name>.yaml``, including its defaults list, as plain data.
 
-    An application of the package also searches the user's ``--config-dir``.
+    A running application of the package also searches the user's ``--config-dir``.
 
     Args:
-        group: name of the group; a subgroup with slashes.
-        name: of the option.
-        key: begins the message of an error; None: the group does.
+        group: Name of the group; subgroups are separated by slashes.
+        name: Name of the option.
+        key: Start of error messages; None: the group.
 
     Raises:
-        InputError: the group has no such option.
+        InputError: The group has no such option.
     """
     with nullcontext() if _is_own() else _application():
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))

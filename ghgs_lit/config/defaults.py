@@ -1,9 +1,9 @@
-"""Defaults of options, which YAML does not repeat.
+"""Defaults of options, which YAML files do not repeat.
 
-A key that no file sets has the default of its class. Hydra refuses overrides of keys that are not
-there, so nodes of options are opened when their file is read. Classes are imported later, because
-libraries come with them: then unknown keys are refused and defaults are filled in. Those of verbs,
-which need no library, are filled in at once.
+A key that no file sets has the default of its class. Hydra rejects overrides of keys that do not exist,
+so option nodes are opened for new keys when their file is read. Their classes are imported later, because
+they import large libraries; only then are unknown keys rejected and defaults filled in. Classes of verbs
+require no library, so their defaults are filled in at once.
 """
 
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ from ghgs_lit.config.registry import class_of_node, has_kind, nodes_of, verb_cla
 
 
 def with_defaults(values: Mapping[str, Any], cls: type[BaseModel]) -> dict[str, Any]:
-    """Values of options, completed by the defaults of their class.
+    """Complete the values of options with the defaults of their class.
 
     Args:
-        values: plain data by key, unchecked; unknown keys stay, for a check to refuse.
-        cls: the class of the options. Fields without a default are not filled in.
+        values: Plain data by key, not validated; unknown keys are kept for validation to reject.
+        cls: Class of the options. Fields without a default are not filled in.
 
     Returns:
         Plain data, keys of the class first and in its order.
@@ -39,7 +39,7 @@ def with_defaults(values: Mapping[str, Any], cls: type[BaseModel]) -> dict[str, 
 
 
 def _over(default: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values over those that a default has set, if it is a mapping, too."""
+    """Merge values over those of a default that is a mapping, too."""
     if not isinstance(default, Mapping):
         return dict(values)
     merged = dict(default)
@@ -49,18 +49,18 @@ def _over(default: Any, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A default as plain data; of options the fields that were set."""
+    """Convert a default to plain data; of options, only fields that were set."""
     if isinstance(value, BaseModel):
         return {name: _plain(getattr(value, name)) for name in value.model_fields_set}
     return list(map(_plain, value)) if isinstance(value, tuple) else value
 
 
 def of_verb(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of a verb with all of its keys; those that must be given are ``???``.
+    """Configuration of a verb with all of its keys; required keys without a value are ``???``.
 
     Args:
-        name: of the verb.
-        values: content of its file, groups included.
+        name: Name of the verb.
+        values: Content of its file, including groups.
     """
     cls = verb_class(name)
     must = {key: MISSING for key, field in cls.model_fields.items() if field.is_required()}
@@ -68,16 +68,16 @@ def of_verb(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fill(cfg: DictConfig) -> DictConfig:
-    """Fill in the defaults of all nodes of options.
+    """Fill in the defaults of all option nodes.
 
     Args:
-        cfg: a composed configuration, which is changed; interpolations stay.
+        cfg: Composed configuration, changed in place; interpolations are kept.
 
     Returns:
         ``cfg``.
 
     Raises:
-        InputError: a node names an unknown kind.
+        InputError: A node has an unknown kind.
     """
     for key, node in list(nodes_of(cfg)):
         if OmegaConf.is_dict(node) and has_kind(key, node):
@@ -89,12 +89,12 @@ def fill(cfg: DictConfig) -> DictConfig:
 
 
 def open_nodes(path: str, package: str, content: DictConfig) -> None:
-    """Let Hydra override keys of options that their file does not set.
+    """Allow Hydra to override keys of options that their file does not set.
 
     Args:
-        path: of the file below the folder of configurations, such as ``bounds/box``.
-        package: value of its line ``@package``; empty: its group.
-        content: the file's, which gets the flag.
+        path: Path of the file relative to the configuration folder, such as ``bounds/box``.
+        package: Value of its ``@package`` line; empty: its group.
+        content: Content of the file, changed in place.
     """
     group = path.split("/")[0]
     root = content if group == path or package == "_global_" else {group: content}

@@ -1,22 +1,21 @@
-"""Dotted keys of configurations, lists of keys that do not influence results,
-and names of ablations."""
+"""Dotted keys of configurations, lists of keys that do not affect results, and names of ablations."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ghgs_lit.errors import require
 
-#: Keys that no result depends on: where a run writes, what it shows and how it shares the machine.
+#: Keys that do not affect results: output paths, displays and the use of the machine.
 WITHOUT_INFLUENCE = (
     "hydra", "allow_random_encoder", "chosen", "dry_run", "overwrite", "resume", "logger", "callbacks",
     "data.cache_dir", "data.cache_images_mb", "data.packed_gb", "data.render_workers",
     "data.workers", "feature_cache.folder",
-    "encoder.weights",  # repeats the origin of init_from's weights, which counts
+    "encoder.weights",  # repeats the origin of the weights of init_from, which is compared
     "evaluation.pictures", "trainer.log_every_n_steps", "trainer.profiler",
 )  # fmt: skip
 
-#: Keys that may change when a run is resumed without being reported: those without influence, the
-#: length of training (``trainer.max_*``) and what is measured after it.
+#: Keys that may change without a report when a run is resumed: those without influence, the
+#: length of training (``trainer.max_*``) and the evaluation after it.
 MAY_CHANGE_ON_RESUME = (
     *WITHOUT_INFLUENCE, "evaluation", "metrics", "sweep", "trainer.max_steps", "trainer.max_time",
 )  # fmt: skip
@@ -25,27 +24,26 @@ MAY_CHANGE_ON_RESUME = (
 #: and the evaluation.
 NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 
-#: Keys of views and targets by which models are trained differently.
+#: Keys of views and targets that affect training.
 OF_TRAINING = ("views.training_counts", "views.training", "targets.training_views", "targets.per_step")
-#: Keys by which a protocol of one name has other targets.
+#: Keys that change the targets of a protocol without changing its name.
 OF_TARGETS = ("targets.kind", "targets.view", "targets.positions", "targets.per_subject")
 
-#: Keys that may differ between the runs of a row of a table: those without influence, the seed, and
-#: views, targets and metrics, which tables keep apart themselves.
+#: Keys that may differ between the runs of a table row: those without influence, the seed, and
+#: views, targets and metrics, which tables distinguish otherwise.
 OF_A_RUN = (*WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "seed", "targets", "views")
-#: Keys that name files and machines: the same run elsewhere has others.
+#: Keys of files and machines, which differ if the same run is repeated elsewhere.
 OF_A_PLACE = ("checkpoint", "data.root", "data.source", "init_from", "trainer.accelerator")
-#: Keys that may differ between the runs of a table: those of a run,
-#: and the switches of the ablation.
+#: Keys that may differ between the runs of a table: :data:`OF_A_RUN` and the switches of the ablation.
 EXPECTED_TO_DIFFER = (*OF_A_RUN, "recalibration.neighborhood", "recalibration.similarity")
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key; an empty mapping is a value.
+    """Values by dotted key; an empty mapping counts as a value.
 
     Args:
-        config: nested mappings, or a single value.
-        prefix: dotted key of ``config`` itself; empty: the whole configuration.
+        config: Nested mappings, or a single value.
+        prefix: Dotted key of ``config`` itself; empty: the whole configuration.
     """
     if not (isinstance(config, Mapping) and config):
         return {prefix: config}
@@ -55,7 +53,7 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-#: More than any configuration has; a file of a few kilobytes can refer to one list a billion times.
+#: Limits far above any configuration; a file of a few kilobytes can refer to one list a billion times.
 _MOST_VALUES = 100_000
 _MOST_LEVELS = 32
 
@@ -64,11 +62,12 @@ def require_plain(config: Any, where: str) -> None:
     """Reject a configuration that YAML cannot express.
 
     Args:
-        config: mappings with keys of text, lists, texts and numbers are plain.
-        where: its file or key, for messages.
+        config: Mappings with text keys, lists, texts and numbers are accepted.
+        where: File or key of the configuration, for messages.
 
     Raises:
-        InputError: it holds another type, or itself, or too much; names the key.
+        InputError: It contains another type, itself, or too many values or levels; the message contains
+            the key.
     """
     left = [(where, config, 0)]
     count = 0
@@ -89,12 +88,7 @@ def require_plain(config: Any, where: str) -> None:
 
 
 def lookup(config: Any, key: str) -> Any:
-    """The value at a dotted key, or None.
-
-    Args:
-        config: nested mappings; other values have no keys.
-        key: dotted key.
-    """
+    """Value at a dotted key, or None. Values other than mappings have no keys."""
     for name in key.split("."):
         if not isinstance(config, Mapping) or name not in config:
             return None
@@ -103,27 +97,21 @@ def lookup(config: Any, key: str) -> Any:
 
 
 def key_of(override: str) -> str:
-    """The key or group of an override such as ``+data.people=3``."""
+    """Key or group of an override such as ``+data.people=3``."""
     return override.split("=", 1)[0].lstrip("+~")
 
 
 def is_hyperparameter(key: str) -> bool:
-    """Whether runs are compared by a key or group."""
+    """Whether a key or group counts as a hyperparameter by which runs are compared."""
     return not is_below(key.replace("/", "."), NOT_HYPERPARAMETERS)
 
 
 def is_below(key: str, parents: Iterable[str]) -> bool:
-    """Whether a dotted key is one of some others or lies below one.
-
-    Args:
-        key: the dotted key.
-        parents: dotted keys.
-    """
+    """Whether a dotted key equals one of some dotted keys or lies below one."""
     return any(key == parent or key.startswith(f"{parent}.") for parent in parents)
 
 
-#: Name of the ablation by its switches (3D unprojection, semantic consistency),
-#: in the order of tables.
+#: Name of the ablation by its switches (3D unprojection, semantic consistency), in the order of tables.
 ABLATIONS = {
     (False, False): "neither",
     (False, True): "no_unprojection",
@@ -133,16 +121,16 @@ ABLATIONS = {
 
 
 def switches_of(config: Mapping[str, Any]) -> tuple[bool, bool]:
-    """The switches of the ablation in a model.
+    """Ablation switches of a model.
 
     Args:
-        config: whole configuration as plain data.
+        config: Whole configuration as plain data.
 
     Returns:
         Whether the model finds neighbours in 3D, and whether it weights attention by similarity.
     """
     recalibration = config["recalibration"]
-    # A plug-in may have other keys.
+    # Kinds of plug-ins may have other keys.
     return recalibration.get("neighborhood", "xyz") == "xyz", recalibration.get("similarity") != "none"
 
 
@@ -150,12 +138,12 @@ def ablation_of(config: Mapping[str, Any]) -> str:
     """Name of a model's row in the ablation table.
 
     Args:
-        config: Resolved configuration of a training. Its ``chosen.ablation``, where it has one, is
-            the option of the group ``ablation`` that was chosen.
+        config: Resolved configuration of a training; its ``chosen.ablation``, if any, is the chosen
+            option of the group ``ablation``.
 
     Returns:
-        The option where it is user-defined; else the name that :data:`ABLATIONS` gives to the
-        model's switches, which the command line may have set one by one.
+        The option if it is user-defined; otherwise the name in :data:`ABLATIONS` of the model's switches,
+        which the command line may have set one by one.
     """
     name = lookup(config, "chosen.ablation")
     return name if is_own_ablation(name) else ABLATIONS[switches_of(config)]

@@ -1,4 +1,4 @@
-"""Options of nodes that belong to no stage, such as ``turntable`` or ``calibration``."""
+"""Options of nodes that do not belong to a stage, such as ``turntable`` or ``calibration``."""
 
 from typing import Annotated, Literal
 
@@ -8,112 +8,112 @@ from ghgs_lit.config.options import Count, Index, Options, PathText, Positive, S
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
-#: A number of input views.
+#: Number of input views.
 Views = Annotated[int, Field(ge=2)]
 
 
 class Calibration(Options):
-    """Corrections of what the file of cameras omits or states wrongly;
-    null: as its format defines it."""
+    """Corrections of values that the camera file omits or states wrongly; null: as defined by its format."""
 
     group = "calibration"
     format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml", "qualisys"] = (
         "auto"
     )
-    """Format of the file."""
+    """Format of the camera file."""
     extrinsics: Literal["world_to_camera", "camera_to_world"] | None = None
-    """What the matrices map."""
+    """Transformation that the matrices describe."""
     axes: Literal["opencv", "opengl"] | None = None
-    """Axes of a camera."""
+    """Axis convention of a camera."""
     intrinsics: Literal["pixels", "normalized", "normalized_principal"] | None = None
-    """Unit of focal lengths and principal point; normalized: shares of width and height."""
+    """Unit of focal lengths and principal point; normalized: fractions of width and height."""
     pixel_centers: Literal["half", "integer"] | None = None
-    """Where the first pixel's centre lies: at 0.5 or at 0."""
+    """Position of the first pixel's centre: half: 0.5; integer: 0."""
     resized: Positive | None = None
-    """By what the photographs were resized after the calibration."""
+    """Factor by which the photographs were resized after calibration."""
     unit: Positive | None = None
-    """Metres of one unit of length."""
+    """Length of one unit in metres."""
     exif: Literal["auto", "stored", "shown"] = "auto"
-    """Which pixels of a turned photograph the calibration is for."""
+    """Pixels of a rotated photograph that the calibration refers to: as stored or as shown."""
     names: Annotated[dict | None, Words("a mapping of photographs to cameras or null")] = None
-    """Camera of a photograph with another name: {photograph: camera}."""
+    """Cameras of photographs whose name differs from the camera's: {photograph: camera}."""
 
 
 class SequenceOptions(Options):
-    """Instants to use, and how the videos of cameras are synchronised."""
+    """Instants to use, and synchronization of the cameras' videos."""
 
     group = "sequence"
     start: int | None = 0
-    """Number of the first instant; negative: from the end."""
+    """Number of the first instant; negative: counted from the end."""
     stop: int | None = None
-    """Number of the first one that no longer counts; negative: from the end."""
+    """Number after the last instant (exclusive); negative: counted from the end."""
     step: Count = 1
-    """Every so many of them."""
+    """Use every step-th instant."""
     sync: PathText | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
-    """Of videos. null: their frames are numbered alike. {camera: frames} by which it began before
-    the others. A CSV (camera,frame,seconds): the frames nearest to those of the first camera."""
+    """Synchronization of videos. null: equal frame numbers are simultaneous. {camera: frames}: number of
+    frames by which the camera began before the others. A CSV file (camera,frame,seconds): frames nearest
+    in time to those of the first camera."""
 
 
 class Turntable(Options):
-    """Pictures around the subject."""
+    """Images rendered on a circle around the subject."""
 
     frames: int = Field(24, ge=0, le=2000)
-    """Number of pictures (0: none); more than 2000 fill a disk before anybody looks."""
+    """Number of images, at most 2000; 0: none."""
     fps: int = Field(12, ge=1, le=1000)
-    """Pictures per second of a video; no player shows more than 1000."""
+    """Frames per second of the video, at most 1000."""
 
 
 class PerScene(Options):
-    """3D Gaussian splatting on each subject's inputs."""
+    """3D Gaussian splatting optimized on each subject's input views."""
 
     steps: int = Field(200, ge=1, le=100000)
-    """Steps of optimisation; whole scenes are published with 30000."""
+    """Optimization steps; published results of whole scenes use 30000."""
 
 
 class Timing(Options):
     """How run times are measured."""
 
     repeats: int = Field(9, ge=1, le=1000)
-    """Rounds that count, enough of them at 1000;
-    each runs all presets, and each begins with another one."""
+    """Timed rounds; each runs all presets, and each starts with a different preset."""
 
 
 class Check(Options):
-    """What task=check expects of data."""
+    """Limits of good data for task=check."""
 
     min_iou: Share = 0.5
-    """Least IoU of a body's silhouette and its mask; below it a camera counts as wrong."""
+    """Minimum IoU of a body's silhouette and its mask; below it, the camera is considered wrong."""
     min_agreement: Share = 0.9
-    """Without bodies: least share of a mask that the subject's other masks and cameras allow."""
+    """Without bodies: minimum share of a mask that is consistent with the subject's other masks and
+    cameras."""
 
 
 class PairedTest(Options):
-    """The test between rows, over seeds and subjects together."""
+    """Paired significance test between rows, over seeds and subjects together."""
 
     group = "test"
     against: Literal["full", "best", "none"] = "full"
-    """full: the row of the whole method | best: the best row of each column | none: no test."""
+    """Reference: full: the row of the complete method | best: the best row of each column | none: no
+    test."""
     alpha: float = Field(0.05, gt=0, lt=1)
     """Significance level."""
     metrics: Texts | None = None
-    """Columns that are tested, all together corrected; null: the first. Others are printed only."""
+    """Tested columns, corrected for multiple testing together; null: the first. Other columns are only
+    printed."""
     unit: Text | None = None
-    """Where subjects are frames of people: a regular expression whose group is the
-    person's name."""
+    """Where subjects are frames of people: regular expression whose group matches the person's name."""
 
 
 class EvaluationOptions(Options):
-    """What is measured after training and by ``ghgs evaluate``:
-    every number of views with every protocol."""
+    """Evaluation after training and by ``ghgs evaluate``: every number of views with every target
+    protocol."""
 
     group = "evaluation"
     views: Views | tuple[Views, ...] | None = None
-    """Numbers of input views (the paper's: 3, 4 and 5); of tables, null: those of the layout."""
+    """Numbers of input views (paper: 3, 4 and 5). For tables, null: those of the layout."""
     targets: Texts | None = ("release", "midway")
-    """Names of files in conf/targets, each with its own values (the paper's: release). The
-    one that targets= selects has the values of this configuration. Of tables, null: all that
-    were measured."""
+    """Names of files in conf/targets, each with its own values (paper: release); the one selected by
+    targets= has the values of this configuration. For tables, null: all that were evaluated."""
     split: Text = "val"
-    """val: unseen in training | train | bench, sealed: frozen people of data=synthetic."""
+    """val: unseen in training | train | bench, sealed: fixed people of data=synthetic."""
     pictures: Index = 4
-    """Number of subjects of each protocol that are drawn into pictures/."""
+    """Number of subjects per protocol whose renders are saved in pictures/."""

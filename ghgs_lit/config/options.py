@@ -1,8 +1,8 @@
 """Options: classes of typed fields that configure a stage, defined once next to it.
 
-A field has a type with a range, a default and, in the text below it, a unit and meaning. Values are
-checked wherever they come from (YAML, command line, checkpoint, Python);
-``ghgs <verb> --help <group>`` prints them.
+A field has a type with a range, a default and, in the text below it, a meaning with its unit. Values are
+validated whatever their source (YAML, command line, checkpoint, Python); ``ghgs <verb> --help <group>``
+prints the fields.
 """
 
 import ast
@@ -38,18 +38,18 @@ _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multi
 
 @dataclass(frozen=True)
 class Words:
-    """Metadata of a type: its name in messages."""
+    """Metadata of a type: its description in messages."""
 
     text: str
 
 
 def expected(field: FieldInfo) -> str:
-    """What ``field`` accepts, in words, such as "an integer >= 1 or null"."""
+    """Describe the values that ``field`` accepts, such as "an integer >= 1 or null"."""
     return _words(field.annotation, field.metadata)
 
 
 def options_of(annotation: Any) -> type[BaseModel] | None:
-    """The class of options that an annotation allows (alone or with None), or None."""
+    """Options class that an annotation allows (alone or with None), or None."""
     for choice in (annotation, *get_args(annotation)):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             return choice
@@ -57,7 +57,7 @@ def options_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def meanings(cls: type) -> dict[str, str]:
-    """The text below each field of a class and its bases."""
+    """Text below each field of a class and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if not (issubclass(base, BaseModel) and inspect.get_annotations(base)):
@@ -70,7 +70,7 @@ def meanings(cls: type) -> dict[str, str]:
 
 
 def _flat(metadata: Iterable[Any]) -> list[Any]:
-    """Metadata of a type, with those inside pydantic's ``Field``."""
+    """Metadata of a type, including those inside pydantic's ``Field``."""
     return [part for item in metadata for part in (item.metadata if isinstance(item, FieldInfo) else [item])]
 
 
@@ -106,8 +106,8 @@ _T = TypeVar("_T", bound="Options")
 
 
 def _text(value: Any) -> Any:
-    """A path as text, and a name that spells a number: ``100846``. Of other numbers, such as 2024.10,
-    the spelling is lost."""
+    """Convert a path or an integer, such as the name ``100846``, to text; floats such as 2024.10 have
+    lost their spelling and are rejected."""
     if isinstance(value, float):
         raise ValueError("a text (in quotes where it spells a number: '\"2024.10\"')")
     is_number = isinstance(value, int) and not isinstance(value, bool)
@@ -136,33 +136,28 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Workers = Annotated[int, Field(ge=0, le=1024)]
 Width = Annotated[int, Field(ge=1, le=65536)]
-#: Number of patches, at most that of pixels along the longest side.
+#: Number of patches, at most the number of pixels along the longest side.
 Patches = Annotated[int, Field(ge=0, le=8192)]
-# A larger photograph would need gigabytes before anything could refuse it.
+# A larger image would take gigabytes before any check could reject it.
 Side = Annotated[int, Field(ge=1, le=8192)]
-#: A side or [height, width] in pixels; read as (height, width).
+#: Side or [height, width] in pixels; read as (height, width).
 Size = Annotated[Side | tuple[Side, Side], AfterValidator(_pair)]
 CropSide = Annotated[int, Field(ge=1, le=2072)]
-#: The same for crops, which the model sees.
+#: The same for crops, the input of the model.
 CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)]
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """`` (did you mean ...?)`` with the closest known name, or an empty string.
-
-    Args:
-        name: what was given.
-        known: all names that there are.
-    """
+    """`` (did you mean ...?)`` with the closest known name, or an empty string."""
     close = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
 class UnknownKey(InputError):
-    """Options have no such field.
+    """Options have no field of this name.
 
     Attributes:
-        key: dotted key that was given.
+        key: Dotted key that was given.
     """
 
     def __init__(self, message: str, key: str):
@@ -171,7 +166,7 @@ class UnknownKey(InputError):
 
 
 class _Checked(type(BaseModel)):
-    """Metaclass that raises :class:`InputError` for options that are made in Python, too."""
+    """Metaclass that raises :class:`InputError` also for options created in Python."""
 
     def __call__(cls, *args: Any, **values: Any) -> Any:
         try:
@@ -181,10 +176,10 @@ class _Checked(type(BaseModel)):
 
 
 class Options(BaseModel, metaclass=_Checked):
-    """Base of all options: immutable, without unknown fields and silent conversions.
+    """Base of all options: immutable, without unknown fields or silent conversions.
 
     Attributes:
-        group: dotted key of the options in configurations, for messages.
+        group: Dotted key of the options in configurations, for messages.
 
     Raises:
         InputError: "<key>: expected ...; found ...", for the first wrong value.
@@ -203,8 +198,8 @@ class Options(BaseModel, metaclass=_Checked):
     @model_validator(mode="before")
     @classmethod
     def _given(cls, values: Any) -> Any:
-        """Lists become tuples; a mapping for options changes those that are the default of
-        their field."""
+        """Convert lists to tuples; a mapping given for a field whose default is options changes only its
+        keys."""
         if not isinstance(values, dict):
             return values
         given = _immutable(values)
@@ -219,15 +214,15 @@ class Options(BaseModel, metaclass=_Checked):
 
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:
-        """Options from a mapping; missing keys have their default.
+        """Create options from a mapping; missing keys have their default.
 
         Args:
-            values: a mapping, a node of OmegaConf, or options of this class, which are returned.
-            key: dotted key of the mapping; empty: the whole configuration.
+            values: A mapping, an OmegaConf node, or options of this class, which are returned.
+            key: Dotted key of the mapping; empty: the whole configuration.
 
         Raises:
-            InputError: names the first wrong key below ``key``,
-                what was expected and what was found.
+            InputError: The message contains the first wrong key below ``key``, what was expected and what
+                was found.
         """
         if isinstance(values, cls):
             return values
@@ -241,23 +236,20 @@ class Options(BaseModel, metaclass=_Checked):
             raise _input_error(cls, key, values, error) from None
 
     def replace(self: _T, **changes: Any) -> _T:
-        """The options with some fields changed; the result is checked.
-
-        Args:
-            **changes: new values by field.
+        """Return a copy with some fields changed; the result is validated.
 
         Raises:
-            InputError: as for :class:`Options`.
+            InputError: See :class:`Options`.
         """
         return type(self)(**{**dict(self), **changes})
 
     def require(self, condition: bool, name: str, expected: str) -> None:
-        """Refuse the value of a field unless a condition holds; for use in a ``model_validator``.
+        """Reject the value of a field unless a condition holds; for use in a ``model_validator``.
 
         Args:
-            condition: whether the value is good.
-            name: of the field.
-            expected: what would be good, in words.
+            condition: Whether the value is valid.
+            name: Name of the field.
+            expected: Description of valid values.
 
         Raises:
             InputError: "<name>: expected <expected>; found ...".
@@ -266,7 +258,7 @@ class Options(BaseModel, metaclass=_Checked):
             raise InputError(f"{name}: expected {expected}; found {shown(_plain(getattr(self, name)))}")
 
     def build(self) -> Any:
-        """Build what the options describe; by default the options themselves."""
+        """Build the object that the options describe; by default the options themselves."""
         return self
 
 
@@ -283,18 +275,8 @@ def _plain(value: Any) -> Any:
 
 
 def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
-    """The first of pydantic's errors, unknown keys first:
-    a misspelt key may leave another one missing.
-
-    Args:
-        cls: the class of options that refused its values.
-        key: dotted key of the options; empty: the whole configuration.
-        values: what the options were made from.
-        error: of pydantic.
-
-    Returns:
-        An error of one line that names the key.
-    """
+    """First of pydantic's errors as one line with its key; unknown keys come first, because a misspelt
+    key may leave another one missing."""
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     cause = first.get("ctx", {}).get("error")
@@ -304,7 +286,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     for name in first["loc"]:
         if nested is None or not isinstance(values, Mapping | list | tuple):
             break
-        if isinstance(name, int):  # of a list of options
+        if isinstance(name, int):  # index in a list of options
             values = values[name]
             continue
         cls = nested
@@ -330,14 +312,14 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
 
 
 def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:
-    """(height, width) in pixels from a side or a pair.
+    """Image size (height, width) in pixels from a side or a pair.
 
     Args:
-        key: dotted key, for the message.
-        size: a side of a square, or [height, width]; at least 1.
+        key: Dotted key, for the message.
+        size: Side of a square, or [height, width]; at least 1.
 
     Raises:
-        InputError: it is neither.
+        InputError: ``size`` is neither.
     """
     pair = (size, size) if isinstance(size, int) else tuple(size)
     valid = len(pair) == 2 and all(isinstance(side, int) and side >= 1 for side in pair)

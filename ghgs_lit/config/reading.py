@@ -1,11 +1,10 @@
-"""Read overrides and files for Hydra, and limit what others' files may set.
+"""Read overrides and files for Hydra, and restrict what external files may set.
 
-Others' are those of ``--config-dir`` and ``hydra.searchpath``.
-Such files can come from somebody else. Their keys of the package's groups are options, which are
-checked as all options are; but the node ``hydra`` can set environment variables, call functions and
-write shell scripts, and resolvers such as ``${oc.env:...}`` read secrets. In such a file the only
-interpolations are references to keys, and of ``hydra`` it may set :data:`SETTABLE`; the command line
-may set all of it.
+External files are those of ``--config-dir`` and ``hydra.searchpath``, which may be untrusted. Their keys
+of the package's groups are options and validated as such. The node ``hydra``, however, can set
+environment variables, call functions and write shell scripts, and resolvers such as ``${oc.env:...}``
+read secrets. Therefore the only interpolations allowed in such a file are references to keys, and of
+``hydra`` it may set only :data:`SETTABLE`; the command line may set all of it.
 """
 
 import io
@@ -32,34 +31,34 @@ from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import check_yaml, read_parsed
 
-#: Of launchers: names and numbers for the queue and the processes, no commands.
+#: Keys of launchers: names and numbers for the queue and the processes, no commands.
 _LAUNCHER = """
     n_jobs backend prefer verbose timeout batch_size
     submitit_folder timeout_min cpus_per_task gpus_per_node tasks_per_node mem_gb nodes name stderr_to_stdout
     partition qos comment constraint exclude gres cpus_per_gpu gpus_per_task mem_per_gpu mem_per_cpu account
     signal_delay_s max_num_timeout array_parallelism
 """
-#: What a file outside of the package may set below ``hydra``.
+#: Keys below ``hydra`` that an external file may set.
 SETTABLE = (
     "mode", "verbose", "run.dir", "sweep.dir", "sweep.subdir", "job.name", "job.chdir", "job.config",
     *(f"launcher.{key}" for key in _LAUNCHER.split()),
     "sweeper.params", "sweeper.max_batch_size",
 )  # fmt: skip
-#: Classes that it may name; Hydra itself demands that the first two are registered plugins.
+#: Classes that it may set; Hydra requires these to be registered plugins.
 _CLASSES = {
     "launcher._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
     "sweeper._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
 }
-#: An interpolation that calls no resolver.
+#: Interpolation that calls no resolver.
 _REFERENCE = re.compile(r"\$\{[\w.\[\]-]+\}")
-#: More values than any configuration has.
+#: Limit of the number of values, far above that of any configuration.
 _MOST_VALUES = 100_000
 
 
 class FileConfigSource(file_config_source.FileConfigSource):
-    """Hydra's reader of files, which checks those that do not belong to the package."""
+    """Hydra's file reader, extended by checks of files that do not belong to the package."""
 
-    # Hydra's registry takes a class of this name for its default, and then does not replace it.
+    # Hydra's registry treats a class of this name as its default, and then does not replace it.
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
@@ -78,14 +77,14 @@ class FileConfigSource(file_config_source.FileConfigSource):
 
 
 def _parsed(text: str) -> tuple[dict[str, str | None], DictConfig]:
-    """The header of a file as Hydra reads it, and the content."""
+    """Header of a file as Hydra reads it, and the content."""
     check_yaml(text, most=_MOST_VALUES)
     return FileConfigSource._get_header_dict(text[:512]), OmegaConf.load(io.StringIO(text))
 
 
 def read_as_ghgs() -> None:
-    """Let Hydra read files as :class:`FileConfigSource` in this process from now on, and keep the spelling
-    of names."""
+    """Make Hydra read files with :class:`FileConfigSource` in this process from now on, and keep the
+    spelling of names."""
     overrides_parser.HydraOverrideVisitor = SpellingVisitor
     _utils.get_yaml_loader = yaml_loader
     SourcesRegistry.instance().types["file"] = FileConfigSource
@@ -93,7 +92,8 @@ def read_as_ghgs() -> None:
 
 @contextmanager
 def reading_as_ghgs() -> Iterator[None]:
-    """Let applications of the block read so; those of another program do not."""
+    """Apply :func:`read_as_ghgs` within the block only; Hydra applications of other programs are not
+    affected."""
     Plugins.instance()  # registers Hydra's sources
     types = SourcesRegistry.instance().types
     before = types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader
@@ -104,17 +104,19 @@ def reading_as_ghgs() -> Iterator[None]:
         types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader = before
 
 
-#: Keys of Hydra that are paths and names, whatever they spell.
+#: Keys of Hydra that are paths or names, even if they look like numbers.
 _PATHS = ("hydra.run.", "hydra.sweep.", "hydra.job.")
-#: Functions of overrides whose arguments are numbers.
+#: Override functions whose arguments are numbers.
 _OF_NUMBERS = ("range", "interval")
 
 _yaml_loader = _utils.get_yaml_loader
 
 
 class SpellingVisitor(HydraOverrideVisitor):
-    """Hydra's reader of overrides, which keeps whole numbers that are spelled in an unusual way as texts,
-    such as ``2024_05_17``, which Hydra reads as 20240517. Keys that are numbers take such texts, too."""
+    """Hydra's parser of overrides, modified to keep integers with unusual spelling as text.
+
+    For example, Hydra reads ``2024_05_17`` as 20240517. Numeric keys accept such texts, too.
+    """
 
     _is_path = False
     _are_numbers = False
@@ -139,7 +141,7 @@ class SpellingVisitor(HydraOverrideVisitor):
 
 
 def yaml_loader() -> type[yaml.SafeLoader]:
-    """OmegaConf's reader of YAML, which keeps spellings, too: ``0426`` is octal in YAML 1.1."""
+    """OmegaConf's YAML loader, modified to keep spellings, too: ``0426`` is octal in YAML 1.1."""
     loader = _yaml_loader()
     loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
     return loader
@@ -150,32 +152,32 @@ def _construct_int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
 
 
 def _spelled(value: float, text: str) -> float | str:
-    """A number, or its text where a number is usually written otherwise."""
+    """The number, or its text if numbers are not usually written this way."""
     return value if str(value) == text.removeprefix("+") else text
 
 
 def check_file(file: Path, name: str, package: str, config: Any) -> None:
-    """Check a configuration file that is not the package's.
+    """Check an external configuration file.
 
     Args:
-        file: its path, for messages.
-        name: the group and its option, such as ``hydra/launcher/mine``.
-        package: of its line ``@package``; empty: its group.
-        config: its content, unresolved.
+        file: Path of the file, for messages.
+        name: Group and option, such as ``hydra/launcher/mine``.
+        package: Value of its ``@package`` line; empty: its group.
+        config: Content of the file, unresolved.
 
     Raises:
-        InputError: it has an interpolation that is no reference to a key, or sets something of Hydra
-            that is not in :data:`SETTABLE`; names file and key.
+        InputError: The file has an interpolation other than a reference to a key, or sets a key of Hydra
+            outside :data:`SETTABLE`; the message contains file and key.
     """
     content = OmegaConf.to_container(config)
     require(isinstance(content, dict), str(file), "keys with values", content)
     for key, value in flatten(content).items():
-        # Hydra drops backslashes of the values of a grid.
+        # Hydra drops backslashes from grid values.
         others = _REFERENCE.sub("", f"{key}={value}".replace("\\", ""))
         require("${" not in others, f"{file}: {key}", "no interpolations but references to keys", value)
     *groups, _ = name.split("/")
     is_of_hydra = groups[:1] == ["hydra"]
-    # The packages of files add up along their lists of defaults.
+    # Packages accumulate along the lists of defaults.
     require("hydra" not in package, f"{file}: @package", "a package outside of hydra", package)
     for entry in chain(*map(_groups, content.pop("defaults", None) or ())):
         moves = "hydra" in entry.partition("@")[2] or (is_of_hydra and re.search("@|^/", entry))
@@ -189,20 +191,15 @@ def check_file(file: Path, name: str, package: str, config: Any) -> None:
 
 
 def _groups(entry: Any) -> list[str]:
-    """Groups and packages of an entry of a list of defaults."""
+    """Groups and packages of an entry of a defaults list."""
     return list(entry) if isinstance(entry, dict) else [str(entry)]
 
 
 def _may_set(key: str, value: Any) -> bool:
-    """Whether a file outside of the package may set a key to a value.
-
-    Args:
-        key: dotted key below ``hydra``.
-        value: unresolved.
-    """
+    """Whether an external file may set a dotted key below ``hydra`` to an unresolved value."""
     if key in _CLASSES:
         return isinstance(value, str) and re.fullmatch(_CLASSES[key], value) is not None
-    # Hydra's instantiate has words such as _target_; a key of a grid is an override.
+    # Hydra's instantiate has keywords such as _target_; keys of a grid are overrides.
     if re.search(r"(^|\.)_|hydra", key):
         return False
     values = value if isinstance(value, list) else [value]
@@ -210,13 +207,8 @@ def _may_set(key: str, value: Any) -> bool:
 
 
 def _is_plain(value: Any, key: str) -> bool:
-    """Whether a value is one, in one line; of what Hydra instantiates not a reference
-    to another node.
-
-    Args:
-        value: without lists and mappings.
-        key: dotted key below ``hydra``.
-    """
+    """Whether a scalar is on one line and, for objects that Hydra instantiates, does not refer to another
+    node."""
     if not isinstance(value, str):
         return value is None or isinstance(value, bool | int | float)
     refers = re.match(r"\s*\$\{(?!hydra\.)", value) and is_below(key, ["launcher", "sweeper"])

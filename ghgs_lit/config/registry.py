@@ -1,13 +1,12 @@
-"""Registry of the kinds of options that a configuration may build, by group, and of verbs;
-a configuration never contains a path of Python code.
+"""Registry of the kinds of options that a configuration may build, by group, and of verbs.
 
-A configuration can come from somebody else's checkpoint, so a node such as
-``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Kinds and
-verbs are registered by the files of the group's subpackage, such as ``ghgs_lit/method/heads``, and by
-plug-ins: modules in the environment variable ``GHGS_PLUGINS`` (Python files or module names,
-separated as in ``PATH``) or entry points in the group ``ghgs_lit.plugins``. The other packages of
-this distribution, ``ghgs_people`` and ``ghgs_capture``, are such entry points; they offer import
-paths, so that nothing is imported before it is chosen.
+A configuration can come from an untrusted checkpoint, so it never contains an import path: a node such as
+``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Kinds and verbs
+are registered by the files of the group's subpackage, such as ``ghgs_lit/method/heads``, and by plug-ins:
+modules in the environment variable ``GHGS_PLUGINS`` (Python files or module names, separated as in
+``PATH``) or entry points in the group ``ghgs_lit.plugins``. The other packages of this distribution,
+``ghgs_people`` and ``ghgs_capture``, are such entry points; they register import paths, so that nothing
+is imported before it is chosen.
 """
 
 import gc
@@ -29,24 +28,24 @@ from ghgs_lit.errors import InputError, shown
 
 VARIABLE = "GHGS_PLUGINS"
 GROUP = "ghgs_lit.plugins"
-#: Groups of what plug-ins register that are no groups of a configuration: verbs,
-#: body models whose parts are known, and terms of the loss, which ``loss.weights`` names.
+#: Registered groups that are not configuration groups: verbs, body models with known parts, and terms of the
+#: loss, which are keys of ``loss.weights``.
 _VERBS = "verb"
 PARTS = "parts"
 TERM = "term"
 
 
 def load_plugins() -> None:
-    """Import the user's plug-ins, so that they register their kinds.
+    """Import the user's plug-ins, which register their kinds.
 
-    Errors inside a module keep their type.
+    Errors raised inside a module keep their type.
 
     Raises:
-        InputError: a file is missing, or another module has its name.
+        InputError: A file is missing, or another module has its name.
     """
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
-        # Files that are opened while the collector is off would be frozen, and not flushed at exit.
+        # Files opened while the collector is disabled would be frozen, and not flushed at exit.
         gc.enable()
         importlib.import_module(name)
 
@@ -57,14 +56,8 @@ def _installed() -> tuple[str, ...]:
 
 
 def _module_of(entry: str) -> str:
-    """Module name of an entry of ``GHGS_PLUGINS``; a file is made importable by its stem.
-
-    Args:
-        entry: a Python file or a module name.
-
-    Raises:
-        InputError: as for :func:`load_plugins`.
-    """
+    """Module name of an entry of ``GHGS_PLUGINS``; the folder of a Python file is added to the import
+    path."""
     entry = entry.strip()
     if not entry.endswith(".py"):
         return entry
@@ -75,7 +68,7 @@ def _module_of(entry: str) -> str:
         raise InputError(f"{VARIABLE}: expected a file name that Python can import; found {path.name!r}")
     folder = str(path.parent)
     if folder not in sys.path:
-        # At the end of the path: the file's neighbours must not hide installed packages.
+        # Appended, so that the file's neighbours do not shadow installed packages.
         sys.path.append(folder)
         importlib.invalidate_caches()
     spec = importlib.util.find_spec(path.stem)
@@ -87,8 +80,8 @@ def _module_of(entry: str) -> str:
 
 _C = TypeVar("_C", bound=Callable)
 
-#: Import path of the options by group and kind, groups in the order in which configurations are saved;
-#: kind None: nodes of the group have no key ``kind``.
+#: Import path of options by group and kind; groups are in the order of saved configurations.
+#: Kind None: nodes of the group have no key ``kind``.
 KINDS: dict[str, dict[str | None, str]] = {
     "data": {
         "humman": "ghgs_lit.data.humman.HuMMan",
@@ -162,26 +155,26 @@ TERMS: dict[str, str] = {
     "silhouette": "ghgs_lit.losses.terms.silhouette",
 }
 
-#: All tables by group.
+#: Shipped import paths by group.
 _SHIPPED: dict[str, Mapping[str | None, str]] = {**KINDS, _VERBS: VERBS, PARTS: {}, TERM: TERMS}
 
-#: Groups of named nodes: ``callbacks.<name>: {kind: ...}``.
+#: Groups of named nodes, such as ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
-#: What plug-ins registered: classes, or import paths.
+#: Classes or import paths registered by plug-ins.
 _REGISTERED: dict[tuple[str, str], type[Options] | str] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
-    """Decorator that registers options as ``<group>: {kind: <kind>, ...}``, or, with the group
-    ``term``, a function or class as the term of the loss that ``loss.weights.<kind>`` weighs.
+    """Decorator that registers options as ``<group>: {kind: <kind>, ...}`` or, with the group ``term``, a
+    function or class as the loss term weighted by ``loss.weights.<kind>``.
 
     Args:
-        group: one of :data:`KINDS`, :data:`TERM` or :data:`PARTS`.
-        kind: a new one of the group.
+        group: One of :data:`KINDS`, :data:`TERM` or :data:`PARTS`.
+        kind: A new kind of the group.
 
     Raises:
-        InputError: there is no such group, or the kind is taken.
+        InputError: The group does not exist, or the kind is taken.
     """
 
     def keep(cls: _C) -> _C:
@@ -196,37 +189,34 @@ def register_verb(name: str) -> Callable[[_C], _C]:
 
     Without a file ``<name>.yaml`` in ``--config-dir`` the verb has its keys and no groups.
 
-    Args:
-        name: a new one.
-
     Raises:
-        InputError: the name is taken.
+        InputError: The name is taken.
     """
     return register(_VERBS, name)
 
 
 def offer(group: str, **paths: str) -> None:
-    """Register options by import path: they are imported when they are chosen.
+    """Register options by import path; they are imported when chosen.
 
     Args:
-        group: one of :data:`KINDS`, or :data:`PARTS`.
-        **paths: import path by kind, such as ``scans="my_package.scans.Scans"``.
+        group: One of :data:`KINDS`, or :data:`PARTS`.
+        **paths: Import path by kind, such as ``scans="my_package.scans.Scans"``.
 
     Raises:
-        InputError: as for :func:`register`.
+        InputError: The group does not exist, or a kind is taken.
     """
     for kind, path in paths.items():
         _keep(group, kind, path)
 
 
 def offer_verbs(**paths: str) -> None:
-    """Register verbs by import path, as :func:`offer` does options.
+    """Register verbs by import path, see :func:`offer`.
 
     Args:
-        **paths: import path by name of the verb.
+        **paths: Import path by name of the verb.
 
     Raises:
-        InputError: a name is taken.
+        InputError: A name is taken.
     """
     offer(_VERBS, **paths)
 
@@ -242,13 +232,12 @@ def _keep(group: str, kind: str, what: type[Options] | str) -> None:
 
 
 def _path_of(what: type[Options] | str) -> str:
-    """Import path without the module, which a file that is loaded twice may have under two
-    names."""
+    """Import path without the module: a file that is loaded twice may have two module names."""
     return what if isinstance(what, str) else what.__qualname__
 
 
 def import_object(path: str) -> Any:
-    """The object of an import path such as ``my_package.scans.Scans``."""
+    """Import the object at a path such as ``my_package.scans.Scans``."""
     module, _, name = path.rpartition(".")
     return getattr(importlib.import_module(module), name)
 
@@ -276,7 +265,7 @@ def verb_class(name: str) -> type[Options]:
 
 @cache
 def _import_subpackage(group: str) -> None:
-    """Import all files of the group's subpackage, so that they register their kinds."""
+    """Import all files of the group's subpackage, which register their kinds."""
     parts = next(iter(KINDS[group].values())).split(".")
     subpackage = ".".join(parts[: 3 if parts[1] == "method" else 2])
     for file in pkgutil.iter_modules(importlib.import_module(subpackage).__path__, f"{subpackage}."):
@@ -296,15 +285,15 @@ def kinds_of(group: str) -> list[str | None]:
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
-    """The options class of a kind.
+    """Options class of a kind.
 
     Args:
-        group: name of a group, such as ``bounds``.
-        kind: value in the node, of any type; None: the group has no kinds.
-        key: dotted key of the node, for messages.
+        group: Name of a group, such as ``bounds``.
+        kind: Value in the node, of any type; None: the group has no kinds.
+        key: Dotted key of the node, for messages.
 
     Raises:
-        InputError: there is no such kind; names the known ones.
+        InputError: The kind does not exist; the message lists the known ones.
     """
     known = _SHIPPED[group]
     if isinstance(kind, str) and kind not in known:
@@ -322,28 +311,29 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
 
 
 def class_of_node(node: Mapping[str, Any], key: str) -> type[Options]:
-    """The options class of a node.
+    """Options class of a node.
 
     Args:
-        node: with ``kind`` where its group has kinds.
-        key: its dotted key.
+        node: Mapping, with ``kind`` if its group has kinds.
+        key: Dotted key of the node.
 
     Raises:
-        InputError: as for :func:`class_of`.
+        InputError: See :func:`class_of`.
     """
     group = key.split(".")[0]
     return class_of(group, None if None in KINDS[group] else node.get("kind"), key)
 
 
 def read_node(node: Any, key: str) -> Options:
-    """The checked options of a node.
+    """Validated options of a node.
 
     Args:
-        node: a mapping of plain data, with ``kind`` where its group has kinds.
-        key: its dotted key, such as ``bounds`` or ``callbacks.best``.
+        node: Mapping of plain data, with ``kind`` if its group has kinds; options are returned as they
+            are.
+        key: Dotted key of the node, such as ``bounds`` or ``callbacks.best``.
 
     Raises:
-        InputError: names the first wrong key, what was expected and what was found.
+        InputError: The message contains the first wrong key, what was expected and what was found.
     """
     if isinstance(node, Options):
         return node
@@ -357,28 +347,29 @@ def read_node(node: Any, key: str) -> Options:
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
-    """The object that a node describes.
+    """Build the object that a node describes.
 
     Args:
-        node: as for :func:`read_node`.
-        key: its dotted key.
-        **extra: further arguments of the ``build`` of its options.
+        node: See :func:`read_node`.
+        key: Dotted key of the node.
+        **extra: Further arguments of the ``build`` method of its options.
 
     Raises:
-        InputError: as for :func:`read_node`.
+        InputError: See :func:`read_node`.
     """
     return read_node(node, key).build(**extra)
 
 
 def nodes_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The nodes of all groups of a configuration, with their dotted keys.
+    """Nodes of all groups of a configuration, with their dotted keys.
 
     Args:
-        config: the whole configuration, or a part of it. A node is a mapping unless it is wrong.
+        config: The whole configuration or a part of it. A node is a mapping unless the configuration is
+            wrong.
     """
     for group in (name for name in config if name in KINDS):
         node = config[group]
-        # A verb that takes its data from a checkpoint may have neither data nor targets.
+        # Null in verbs that take their data from a checkpoint.
         if node is None and group in ("data", "targets"):
             continue
         if group in NAMED and isinstance(node, Mapping):
@@ -388,27 +379,27 @@ def nodes_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def has_kind(key: str, node: Mapping[str, Any]) -> bool:
-    """Whether a node describes an object: keys that change a checkpoint's data have no kind,
-    for example.
+    """Whether a node describes an object; for example, keys that change the data of a checkpoint have no
+    kind.
 
     Args:
-        key: dotted key of the node.
-        node: what its group has under it.
+        key: Dotted key of the node.
+        node: Value of the node.
     """
     return "kind" in node or None in KINDS[key.split(".")[0]]
 
 
 def read_nodes(config: Mapping[str, Any]) -> dict[str, Options]:
-    """The checked options of the nodes of all groups.
+    """Validated options of the nodes of all groups.
 
     Args:
-        config: the whole configuration as plain data.
+        config: The whole configuration as plain data.
 
     Returns:
-        Options by the node's dotted key, without nodes that lack their kind.
+        Options by dotted key of the node, without nodes that lack their kind.
 
     Raises:
-        InputError: as for :func:`read_node`.
+        InputError: See :func:`read_node`.
     """
     options = {}
     for key, node in nodes_of(config):

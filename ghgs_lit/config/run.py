@@ -1,4 +1,4 @@
-"""A whole configuration as one object, checked once."""
+"""A whole configuration as one validated object."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Self
@@ -8,7 +8,7 @@ from pydantic import PrivateAttr
 from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, read_nodes
 
-if TYPE_CHECKING:  # libraries come with them
+if TYPE_CHECKING:  # they import large libraries
     from ghgs_lit.config.nodes import Calibration, EvaluationOptions
     from ghgs_lit.data.augmentation import Augmentation
     from ghgs_lit.data.dataset import DataOptions
@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # libraries come with them
     from ghgs_lit.training.features import DiskFeatureCache
     from ghgs_lit.training.trainer import TrainerOptions
 
-#: Entry of a configuration that is neither a key of a verb nor a group: what tables call a run by.
+#: Entry of a configuration that is neither a key of a verb nor a group: names by which tables identify a run.
 CHOSEN = "chosen"
 
 
@@ -32,12 +32,12 @@ def _is_of_verb(key: str) -> bool:
 
 
 class Run(Options):
-    """Keys of a verb as fields, options of each config group as attributes;
-    None: it has no such group.
+    """Configuration of a run: keys of the verb are fields, options of each config group are attributes;
+    None if the verb has no such group.
 
-    Types are those of the shipped kinds that verbs read; a user-defined kind has these
-    attributes, too. A node without a kind where its group has kinds, such as changes of a
-    checkpoint's data, is part of :attr:`plain` alone.
+    The types are those of the shipped kinds that verbs read; user-defined kinds must have the same
+    attributes. A node without a kind where its group has kinds, such as changes to a checkpoint's data,
+    appears only in :attr:`plain`.
     """
 
     if TYPE_CHECKING:
@@ -64,29 +64,29 @@ class Run(Options):
 
     @classmethod
     def begin(cls, config: Mapping[str, Any]) -> Self:
-        """Check the keys of the verb alone, which needs no library.
+        """Validate only the keys of the verb, which requires no library.
 
         Args:
-            config: the whole configuration as plain data.
+            config: The whole configuration as plain data.
 
         Raises:
-            InputError: a key is unknown, or a value has a wrong type or range.
+            InputError: A key is unknown, or a value has a wrong type or range.
         """
         run = cls.read({key: config[key] for key in config if _is_of_verb(key)}, "")
         run._plain = dict(config)
         return run
 
     def complete(self, config: Mapping[str, Any]) -> Self:
-        """Check the groups, too.
+        """Validate the groups, too.
 
         Args:
-            config: as for :meth:`begin`, with the defaults of all nodes.
+            config: The whole configuration as plain data, with the defaults of all nodes.
 
         Returns:
             This run.
 
         Raises:
-            InputError: names the first wrong key of a node.
+            InputError: The message contains the first wrong key of a node.
         """
         self._plain = dict(config)
         self._nodes = read_nodes(config)
@@ -94,13 +94,13 @@ class Run(Options):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Self:
-        """Check the whole configuration.
+        """Validate a whole configuration.
 
         Args:
-            config: as plain data, with the defaults of all nodes.
+            config: Plain data, with the defaults of all nodes.
 
         Raises:
-            InputError: as for :meth:`begin` and :meth:`complete`.
+            InputError: See :meth:`begin` and :meth:`complete`.
         """
         return cls.begin(config).complete(config)
 
@@ -112,28 +112,28 @@ class Run(Options):
 
     @property
     def plain(self) -> dict[str, Any]:
-        """The whole configuration as it is saved, in plain data; not to be changed."""
+        """The whole configuration as saved, in plain data; must not be modified."""
         return self._plain
 
     def changed(self, **nodes: Mapping[str, Any]) -> Self:
-        """The run with some keys of nodes changed; the result is checked.
+        """Return a copy with some keys of nodes changed; the result is validated.
 
         Args:
-            **nodes: new values by key, as plain data, of groups that the run has.
+            **nodes: New values by key, as plain data, for groups that the run has.
 
         Raises:
-            InputError: as for :meth:`of`.
+            InputError: See :meth:`of`.
         """
         return self.replace(**{group: {**self._plain[group], **keys} for group, keys in nodes.items()})
 
     def replace(self, **changes: Any) -> Self:
-        """The run with other values of keys, and other nodes; the result is checked.
+        """Return a copy with other values of keys or other nodes; the result is validated.
 
         Args:
-            **changes: new values by key, and new nodes by group, as plain data.
+            **changes: New values by key and new nodes by group, as plain data.
 
         Raises:
-            InputError: as for :meth:`of`.
+            InputError: See :meth:`of`.
         """
         config = {**self._plain, **changes}
         run = self.begin(config) if any(map(_is_of_verb, changes)) else self.model_copy()
