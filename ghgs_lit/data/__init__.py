@@ -1,1 +1,1 @@
-"""Photographs of people: reading, sampling and batching of data sets."""
+"""Data sets of people: reading, sampling, augmentation and batching of images."""

@@ -1,6 +1,6 @@
 """Augmentation of training batches: image sizes and imperfections of captures.
 
-A batch depends on (seed, step, index) alone, as its samples do, so that runs resume exactly.
+Like its samples, an augmented batch depends only on (seed, step, index), so that runs resume exactly.
 """
 
 import dataclasses
@@ -28,12 +28,13 @@ from ghgs_lit.data.imperfections import (
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
 
-# Streams of random numbers in addition to those of ghgs_lit.data.sampling.
+# Keys of random streams, in addition to those of ghgs_lit.data.sampling.
 _SIZES = 3
 _IMPERFECTIONS = 4
 _CHANCE = 5
 
-#: Greatest diameter of a missing piece of a mask over the subject's height, as of a hand or foot.
+#: Maximum diameter of a missing piece of a mask, such as a hand or foot, as a fraction of the
+#: subject's height.
 HOLE = 0.12
 
 Size = tuple[int, int]
@@ -42,47 +43,47 @@ Pixels = Annotated[float, Field(ge=0, le=64)]
 
 
 class Augmentation(Options):
-    """Variation of training batches; null and 0: none. Pixels are those of the inputs at their
-    drawn size. Targets keep their colours and cameras, except that principal points move with cut
-    subjects. Depth maps keep the z-depths in the true cameras: the depth loss compares with the distance
-    of the surface, not with one that compensates the error of a camera."""
+    """Augmentation of training batches; null and 0: none. Pixels are those of the inputs at their
+    sampled size. Targets keep their colours and cameras, except that principal points move with cut
+    subjects. Depth maps keep the z-depths in the true cameras: the depth loss compares with the true
+    distance of the surface, not with one that compensates for the error of a camera."""
 
     group = "augmentation"
 
     sizes: tuple[options.Size, ...] | None = None
-    """Sides or [height, width] of the inputs;
-    one is sampled for each step, the same in all processes."""
+    """Sides or [height, width] of the inputs in pixels; each step samples one, the same in all
+    processes."""
     target_scale: tuple[Positive, Positive] | None = None
-    """[least, greatest] size of the targets over that of the inputs, sampled likewise; never larger
-    than data.target_size, as photographs that are enlarged teach blur."""
+    """[minimum, maximum] ratio of the sizes of targets and inputs, sampled likewise. Targets are never
+    larger than data.target_size, as enlarged images would teach blur."""
     chance: Share = 1.0
-    """Share of the steps whose inputs are imperfect in the ways below."""
+    """Share of the steps whose inputs get the imperfections below."""
     exact_from: Count | None = None
-    """Step of training from which all inputs are exact: the last part of a run; null: never."""
+    """Training step from which on inputs have no imperfections, for the last part of a run;
+    null: never."""
     exposure: Stops = 0.0
-    """Stops: greatest deviation of single cameras; 16 are from black to white."""
+    """Maximum deviation of the exposure of single cameras, in stops; 16 span black to white."""
     white_balance: Stops = 0.0
-    """Stops: greatest deviation of red and of blue of single cameras."""
+    """Maximum deviation of red and of blue of single cameras, in stops."""
     gamma: Share = 0.0
-    """Greatest natural logarithm of the power to which single cameras raise colours:
-    their tone curves."""
+    """Maximum natural logarithm of the power to which single cameras raise colours, as their tone
+    curve."""
     cut: Share = 0.0
-    """Share of the samples whose feet or legs are outside the frame: in all photographs,
-    or in some."""
+    """Share of the samples whose feet or legs are outside the frame, in all images or in some."""
     mask_offset: Pixels = 0.0
-    """Pixels that masks grow or shrink by at most; inputs are then black outside them."""
+    """Maximum growth or shrinkage of masks in pixels; inputs are then black outside them."""
     mask_ragged: Pixels = 0.0
-    """Pixels: greatest height of bumps of the outlines of masks."""
+    """Maximum height in pixels of bumps along the outlines of masks."""
     mask_hole_chance: Share = 0.0
-    """How often a piece of a mask is missing,
-    of a diameter of up to 0.12 of the subject's height."""
+    """Probability that a piece of a mask is missing, with a diameter of up to 0.12 of the subject's
+    height."""
     background: Share = 0.0
-    """Share of samples with wrong masks that were taken before a background, which a mask that is
-    too large shows; behind the others it is black."""
+    """Share of the samples with perturbed masks that get a background, which is visible where a mask is
+    too large; the others are on black."""
     refined: Share = 0.0
-    """Share of the samples before a background whose masks were refined, as by refine_masks."""
+    """Share of the samples with a background whose masks are then refined, as by refine_masks."""
     calibration: Amount = 0.0
-    """Pixels: greatest error of the cameras of the inputs."""
+    """Maximum error of the input cameras in pixels."""
 
     @model_validator(mode="after")
     def _check(self) -> "Augmentation":
@@ -93,7 +94,7 @@ class Augmentation(Options):
 
     @property
     def changes_photographs(self) -> bool:
-        """Whether some step sees pixels of the inputs that no other step does."""
+        """Whether the pixels of an input image can differ between steps."""
         limits = (self.exposure, self.white_balance, self.gamma, self.cut, *self._of_masks)
         return self.sizes is not None or (self.chance > 0 and any(limits))
 
@@ -107,17 +108,17 @@ class Augmentation(Options):
         return self.sizes is not None or self.target_scale is not None
 
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
-        """Sizes of the inputs and targets of a step.
+        """Sample the sizes of the inputs and targets of a step.
 
         Args:
-            size: (height, width) of the inputs in pixels without variation.
-            target: (height, width) of the targets in pixels without variation,
-                which sampled ones never exceed.
-            seed: of the run.
-            step: of training, the same number in all processes.
+            size: configured (height, width) of the inputs in pixels.
+            target: configured (height, width) of the targets in pixels, which sampled sizes never
+                exceed.
+            seed: seed of the run.
+            step: training step, equal in all processes.
 
         Returns:
-            (height, width) in pixels of the inputs and of the targets.
+            (height, width) of the inputs and of the targets in pixels.
         """
         rng = np.random.default_rng([seed, _SIZES, step])
         chosen, share = rng.uniform(size=2)
@@ -132,17 +133,16 @@ class Augmentation(Options):
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
-        """The batch of a step with the imperfections of captures,
-        in a share ``chance`` of the steps.
+        """Apply the imperfections of captures to a batch in a share ``chance`` of the steps.
 
         Args:
-            batch: samples as they are read.
-            seed: of the run.
-            step: of training.
-            indices: numbers of the samples in the run.
+            batch: samples as read from disk.
+            seed: seed of the run.
+            step: training step.
+            indices: indices of the samples in the run.
 
         Returns:
-            The same batch in exact steps; otherwise as :meth:`imperfections`.
+            The batch, unchanged in steps without imperfections; otherwise see :meth:`imperfections`.
         """
         limits = (self.exposure, self.white_balance, self.gamma, self.cut, self.calibration, *self._of_masks)
         is_last = self.exact_from is not None and step >= self.exact_from
@@ -154,12 +154,12 @@ class Augmentation(Options):
         return self.imperfections(batch, rngs)
 
     def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
-        """The batch with the imperfections of captures;
-        images stay in [0, 1], and no mask becomes empty.
+        """Apply the imperfections of captures to a batch. Images stay in [0, 1], and no mask becomes
+        empty.
 
         Args:
-            batch: of at least two views.
-            rngs: for each element; each kind of variation has its own stream.
+            batch: a batch with at least two views.
+            rngs: generator of each element; each kind of imperfection uses its own stream.
         """
         streams = [rng.spawn(6) for rng in rngs]
         if self.cut:
@@ -198,15 +198,15 @@ class Augmentation(Options):
         outlines: np.random.Generator,
         behind: np.random.Generator,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Images on black, masks and mattes of one element as a segmentation would leave them."""
+        """Images on black, masks and mattes of one element, with the errors of a segmentation."""
         limits = (self.mask_offset, self.mask_ragged, HOLE, self.mask_hole_chance)
         wrong = torch.from_numpy(np.stack([perturb_mask(mask, *limits, outlines) for mask in masks.numpy()]))
         has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)
         if not has_background:
-            # Pixels that the segmentation adds are counted as a whole.
+            # Pixels that the segmentation adds get a matte of 1.
             return images * wrong[:, None], wrong, torch.where(wrong > masks, 1, mattes * wrong)
         patterns = torch.from_numpy(draw_backgrounds(*masks.shape, behind)).to(images)
-        # Brightened colours may exceed their share of a pixel.
+        # Brightened colours may exceed the share of the pixel that they cover.
         photographs = (images + (1 - mattes[:, None]) * patterns).clamp(max=1)
         if not is_refined:
             return photographs * wrong[:, None], wrong, wrong.to(images)
@@ -219,7 +219,7 @@ class Augmentation(Options):
         subjects, refined = (
             torch.from_numpy(np.stack(each)).to(images) / 255 for each in zip(*pairs, strict=True)
         )
-        kept = (refined > 0.5).flatten(1).any(1)[:, None, None]  # no mask is emptied
+        kept = (refined > 0.5).flatten(1).any(1)[:, None, None]  # no mask becomes empty
         refined = torch.where(kept, refined, wrong.to(images))
         images = torch.where(kept[:, None], subjects.movedim(-1, 1), photographs * wrong[:, None])
         return images, refined > 0.5, refined

@@ -1,5 +1,4 @@
-"""Batches from samples, and the processes that load them; an item of the torch datasets here is a
-whole :class:`Batch`."""
+"""Datasets whose items are whole :class:`Batch` objects, and their loaders."""
 
 import itertools
 import multiprocessing
@@ -18,25 +17,25 @@ from ghgs_lit.data.sampling import Sample, TrainingSampler
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_lit.types import Batch
 
-#: Batches below which processes take longer to start than they save: forked ones,
-#: and those that import.
+#: Number of batches below which worker processes take longer to start than they save: forked workers,
+#: and workers that import all modules.
 _FEW_FORKED = 32
 _FEW_STARTED = 256
-#: More processes than this wait for the disk.
+#: Maximum number of workers; more wait for the disk.
 _MOST = 8
 
 
 @dataclass(frozen=True)
 class TrainingBatches(Dataset):
-    """Item ``step`` is the batch of process ``rank`` of ``world`` at that step of the run.
+    """Training batches; item ``step`` is the batch of process ``rank`` of ``world`` at a step of the run.
 
     Args:
-        photographs: of the subjects.
-        sampler: draws samples.
-        augmentation: varies batches.
-        length: steps of an epoch.
+        photographs: images of the subjects.
+        sampler: selects the samples of a step.
+        augmentation: augmentation of batches.
+        length: number of steps of an epoch.
         depths: whether depth maps of the inputs are read.
-        rank: number of this process.
+        rank: index of this process.
         world: number of processes.
     """
 
@@ -52,7 +51,7 @@ class TrainingBatches(Dataset):
         return self.length
 
     def sizes(self, step: int) -> tuple[Size, Size]:
-        """(height, width) of the inputs and of the targets at a step."""
+        """(height, width) in pixels of the inputs and of the targets at a step."""
         fixed = self.photographs.size, self.photographs.target_size
         step_of_class = step // self.sampler.class_steps
         return self.augmentation.draw_sizes(*fixed, self.sampler.seed, step_of_class)
@@ -65,12 +64,12 @@ class TrainingBatches(Dataset):
 
 
 class EvaluationBatches(Dataset):
-    """Fixed samples; an item has consecutive ones with equal target protocols.
+    """Batches of fixed samples; an item contains consecutive samples with equal target protocols.
 
     Args:
-        photographs: of the subjects.
+        photographs: images of the subjects.
         samples: the samples.
-        batch_size: largest number of samples in an item.
+        batch_size: maximum number of samples of an item.
     """
 
     def __init__(self, photographs: Photographs, samples: Sequence[Sample], batch_size: int) -> None:
@@ -88,14 +87,14 @@ class EvaluationBatches(Dataset):
 
 
 class StepSampler(DistributedSampler):
-    """Steps of one epoch, counted from the beginning of the run.
+    """Sampler of the steps of one epoch, counted from the beginning of the run.
 
-    A ``DistributedSampler``, because with several processes Lightning replaces any other sampler by
-    its own; the datasets divide samples among processes themselves.
+    It is a ``DistributedSampler`` because, with several processes, Lightning would replace any other
+    sampler; the datasets themselves divide samples among processes.
 
     Args:
-        dataset: its length is that of the epoch.
-        first_step: is called when the epoch starts, and gives its first step.
+        dataset: dataset with the length of the epoch.
+        first_step: called at the start of the epoch; returns its first step.
     """
 
     def __init__(self, dataset: Dataset, first_step: Callable[[], int]) -> None:
@@ -111,20 +110,20 @@ class StepSampler(DistributedSampler):
 
 
 def choose_workers(batches: float, processes: int, on_gpu: bool, cores: int | None = None) -> int:
-    """The number of loading processes of ``data.workers=auto``.
+    """Choose the number of workers for ``data.workers=auto``.
 
-    None for a few batches, and none on a CPU: the model needs the cores itself, and a batch takes
-    longer to come from another process than to be read from packed files. Beside a GPU as many as
-    there are cores for each process, less its own, at least 1 and at most 8.
+    There are none for few batches, and none on a CPU: the model needs the cores, and reading a batch
+    from packed files is faster than its transfer from another process. With a GPU, each process has one
+    worker per core that it can use, except its own core, but at least 1 and at most 8.
 
     Args:
-        batches: number of batches that are loaded; infinite where it is not known.
-        processes: processes of this machine that each load batches, such as one for each GPU.
+        batches: number of batches to load; infinite if unknown.
+        processes: number of processes on this machine that load batches, such as one per GPU.
         on_gpu: whether batches are for a GPU.
-        cores: cores of this machine; None: those that this process may use.
+        cores: number of cores of this machine; None: those that this process may use.
 
     Returns:
-        Number of loading processes of each process.
+        Number of workers of each process.
     """
     use_known_start_method()
     few = _FEW_FORKED if multiprocessing.get_start_method() == "fork" else _FEW_STARTED
@@ -135,16 +134,16 @@ def choose_workers(batches: float, processes: int, on_gpu: bool, cores: int | No
 
 
 def make_loader(batches: Dataset, workers: int, **options: Any) -> DataLoader:
-    """A loader whose items are whole batches.
+    """Build a loader for a dataset whose items are whole batches.
 
     Args:
-        batches: the batches.
-        workers: number of loading processes; 0: none.
-        options: of the ``DataLoader``, such as its sampler.
+        batches: dataset of batches.
+        workers: number of worker processes; 0: none.
+        options: further options of ``DataLoader``, such as a sampler.
     """
     use_known_start_method()
     with warnings.catch_warnings():
-        # Each loader would warn of more workers than cores, which were configured.
+        # Each loader would warn of more workers than cores, although these were configured.
         warnings.filterwarnings("ignore", "This DataLoader will create")
         return DataLoader(
             batches,
@@ -158,7 +157,8 @@ def make_loader(batches: Dataset, workers: int, **options: Any) -> DataLoader:
 
 
 def _ignore_signals(number: int) -> None:
-    """Ctrl-C reaches every process of a terminal, and what SLURM sends before a job's end every one of
-    the job; the one that trains ends the others."""
+    """Ignore signals in a worker. Ctrl-C reaches all processes of a terminal, and the signals that SLURM
+    sends before a job's end reach all of the job; only the training process handles them, and ends its
+    workers."""
     for each in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
         signal.signal(each, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Check of a data set: read all of it once, and report what is there, missing and broken."""
+"""Check of a data set: read it once completely, and report what exists, is missing or is broken."""
 
 import hashlib
 import json
@@ -26,32 +26,33 @@ from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
 
-# MiB of decoded files kept, so that a body is read once for all photographs of its subject.
+# MiB of decoded files kept in memory, so that a body is read once for all images of its subject.
 _CACHE_MB = 4
-# A subject whose channels are all below this, of 255, counts as black.
+# A subject with all channels below this value, of 255, counts as black.
 _BLACK = 8
-# Metres: taller subjects suggest another unit.
+# Height in metres above which another unit is likely.
 _TALLEST = 10.0
-# Lines of problems on the terminal; check.json has all.
+# Maximum number of problems shown on the terminal; check.json contains all.
 _SHOWN = 30
 
 
 @dataclass
 class Reading:
-    """Result of reading one photograph.
+    """Result of reading one image.
 
     Attributes:
-        name: of the subject.
-        position: number of the camera.
-        view: its number at the position.
-        place: the photograph in messages.
-        problem: line on what is wrong.
+        name: name of the subject.
+        position: index of the camera.
+        view: number of the view at this position.
+        place: name of the image in messages.
+        problem: message about what is wrong; None: nothing.
         has_body: whether the subject has a body.
-        iou: of body and mask, in [0, 1] (:func:`measure_overlap`); None: there is no body to compare.
-        agreement: share of the mask that the other masks allow, where there is no body to compare.
-        tall: the subject's largest side in world units, by body or masks.
-        digest: of the photograph's pixels.
-        silhouette: coarse mask, where there is no body to compare.
+        iou: IoU of body and mask, in [0, 1] (:func:`measure_overlap`); None: no body to compare with.
+        agreement: share of the mask inside the visual hull of the subject's other masks; None if there is a
+            body to compare with.
+        tall: the subject's largest extent in world units, by its body or masks.
+        digest: digest of the image's pixels.
+        silhouette: coarse mask; None if there is a body to compare with.
     """
 
     name: str
@@ -72,9 +73,9 @@ class Report:
     """Result of a check.
 
     Attributes:
-        phases: by phase, numbers of what was read, and mean and least IoU and agreement.
-        problems: lines ``<place>: expected ...; found ...`` that prevent training.
-        notes: lines that do not.
+        phases: by phase, counts of what was read, and mean and minimum IoU and agreement.
+        problems: lines ``<place>: expected ...; found ...`` about what prevents training.
+        notes: lines about what does not.
     """
 
     phases: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -98,7 +99,7 @@ class Report:
 
 @dataclass(frozen=True)
 class _Readings(Dataset):
-    """Item ``i`` is the result of reading photograph ``i``."""
+    """Dataset whose item ``i`` is the result of reading image ``i``."""
 
     photographs: Photographs
     listed: Sequence[tuple[str, int, int]]
@@ -116,7 +117,7 @@ class _Readings(Dataset):
         return reading
 
     def _examine(self, reading: Reading) -> None:
-        """Read and measure a photograph; InputError: it is missing, broken or implausible."""
+        """Read and measure an image; raises InputError if it is missing, broken or implausible."""
         photograph = reading.name, reading.position, reading.view
         view = self.photographs.view(*photograph)
         body = self.photographs.body(reading.name)
@@ -145,10 +146,10 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
 
     Args:
         data: the data module.
-        min_iou: least IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75
-            to 0.95, wrong cameras 0 to 0.4.
-        min_agreement: without a body, least share of a mask that the subject's other masks allow,
-            in [0, 1]; right cameras reach 0.98 to 1.
+        min_iou: minimum IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75 to
+            0.95, wrong cameras 0 to 0.4.
+        min_agreement: without a body, the minimum share of a mask that the subject's other masks allow,
+            in [0, 1]; correct cameras reach 0.98 to 1.
     """
     report = Report()
     dataset = data.dataset
@@ -186,7 +187,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
 def _read(
     reader: Reader, targets: TargetProtocol, min_iou: float, data: PhotographsDataModule, label: str
 ) -> list[Reading]:
-    """Read the photographs of a phase that exist or that a target protocol may ask for."""
+    """Read the images of a phase that exist or that a target protocol may require."""
     needed = {RING_VIEW} | targets.view_numbers
     listed = []
     for name, positions in reader.subjects.items():
@@ -202,7 +203,7 @@ def _read(
 
 
 def _compare_masks(readings: Sequence[Reading], least: float) -> None:
-    """Fill in agreement and height of masks without a body; at most one problem for each subject."""
+    """Set the agreement and height of masks without a body; reports at most one problem a subject."""
     by_subject: dict[str, list[Reading]] = {}
     for one in readings:
         if one.silhouette is not None:
@@ -276,7 +277,7 @@ def _describe_oddities(
 
 
 def _find_leaks(root: str, train: Sequence[Reading], val: Sequence[Reading]) -> list[str]:
-    """Problems: subjects, or photographs under different names, in both ``train`` and ``val``."""
+    """Find subjects, or equal images under different names, that are in both ``train`` and ``val``."""
     both = sorted({one.name for one in train} & {one.name for one in val})
     lines = [f"{root}: expected each subject in train or in val; found {name!r} in both" for name in both]
     trained = {one.digest: one for one in train if one.digest is not None}

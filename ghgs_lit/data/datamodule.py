@@ -40,11 +40,11 @@ Targets = TargetProtocol | Mapping[str, Any]
 
 
 def count_trained_batches(trainer: Trainer | None, length: int) -> int:
-    """Number of batches that each process has trained on so far, also after a resume.
+    """Count the batches on which each process has trained so far, also after a resume.
 
     Args:
-        trainer: Lightning's; None: 0 batches.
-        length: batches of an epoch, whose last step may have fewer than
+        trainer: Lightning's Trainer; None: 0 batches.
+        length: number of batches of an epoch, whose last step may have fewer than
             ``accumulate_grad_batches``.
     """
     if trainer is None:
@@ -55,11 +55,11 @@ def count_trained_batches(trainer: Trainer | None, length: int) -> int:
 
 
 def count_planned_batches(trainer: Trainer | None, length: int) -> float:
-    """Number of batches that each process will train on; infinite where nothing limits it.
+    """Count the batches on which each process will train; infinite without a limit.
 
     Args:
-        trainer: its limits count; None: there are none.
-        length: batches of an epoch.
+        trainer: Lightning's Trainer, with limits of steps or epochs; None: no limits.
+        length: number of batches of an epoch.
     """
     limits = [math.inf]
     if trainer is not None and trainer.max_steps > 0:
@@ -74,22 +74,22 @@ def _read_protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol
     return [read_node(protocol, "targets") for protocol in several]
 
 
-#: Steps of an epoch, at least.
+#: Minimum number of steps of an epoch.
 LEAST_STEPS = 100
 
 
 class PhotographsDataModule(LightningDataModule):
-    """Loaders of a data set.
+    """Loaders of a data set for training and evaluation.
 
     Args:
         dataset: options of the data set.
-        views: choice of the inputs.
-        targets: choice of the targets.
-        seed: of all random numbers.
-        augmentation: variation of training batches; None: none.
+        views: protocol of the input views.
+        targets: protocol of the target views.
+        seed: seed of all random numbers.
+        augmentation: augmentation of training batches; None: none.
 
     Raises:
-        InputError: an unknown key or impossible value; when data is read, missing or bad files.
+        InputError: an unknown key or an impossible value; while data is read, a missing or bad file.
     """
 
     def __init__(
@@ -107,8 +107,7 @@ class PhotographsDataModule(LightningDataModule):
         self.augmentation = read_node(augmentation or {}, "augmentation")
         dataset.check_targets(self.targets)
         self.seed = seed
-        #: Whether training reads depth maps;
-        #: evaluation reads them all the same, for its depth error.
+        #: Whether training reads depth maps; evaluation always does, for its depth error.
         self.trains_on_depths = True
         self._photographs: dict[str, Photographs] = {}
 
@@ -118,10 +117,7 @@ class PhotographsDataModule(LightningDataModule):
         return {**self.dataset.facts, "resampling": self.dataset.resampling}
 
     def prepare_data(self, splits: Sequence[str] = PHASES) -> None:
-        """Make missing data.
-
-        Args:
-            splits: names of splits.
+        """Create the missing data of splits.
 
         Raises:
             InputError: the data set has no such split.
@@ -131,10 +127,7 @@ class PhotographsDataModule(LightningDataModule):
         self.dataset.prepare(splits)
 
     def photographs(self, phase: str) -> Photographs:
-        """Photographs of a split, listed at their first use.
-
-        Args:
-            phase: name of the split.
+        """Images of a split; files are listed at the first call.
 
         Raises:
             InputError: the data set has no such split.
@@ -147,14 +140,14 @@ class PhotographsDataModule(LightningDataModule):
         return self._photographs[phase]
 
     def subjects(self, phase: str) -> dict[str, tuple[int, ...]]:
-        """Names and camera positions of the subjects of a phase."""
+        """Camera positions of the subjects of a split by name."""
         return self.photographs(phase).reader.subjects
 
     def training_sampler(self, targets: TargetProtocol | None = None) -> TrainingSampler:
         """Sampler of training.
 
         Args:
-            targets: choice of the targets; None: this module's.
+            targets: protocol of the target views; None: this module's.
         """
         data = self.dataset
         protocols = (self.views, self._check_static(targets or self.targets))
@@ -162,15 +155,15 @@ class PhotographsDataModule(LightningDataModule):
         return TrainingSampler(self.subjects("train"), *protocols, *numbers)
 
     def training_batch(self, step: int) -> Batch:
-        """The batch of a single process at ``step``."""
+        """The training batch at ``step`` in a run with a single process."""
         return self.training_batches(step + 1)[step]
 
     def training_batches(self, length: int, rank: int = 0, world: int = 1) -> TrainingBatches:
-        """Batches of training for one process.
+        """Training batches of one process.
 
         Args:
-            length: steps of an epoch.
-            rank: number of this process.
+            length: number of steps of an epoch.
+            rank: index of the process.
             world: number of processes.
         """
         photographs = self.photographs("train")
@@ -178,8 +171,8 @@ class PhotographsDataModule(LightningDataModule):
         return TrainingBatches(*parts, length, self.trains_on_depths, rank, world)
 
     def _use_packs(self, batches: float, rank: int) -> None:
-        """Read photographs of training from packed files, where these fit on the disk; missing files are
-        written only if the run loads more photographs than there are."""
+        """Read training images from packed files if these fit on the disk. Missing files are written only
+        if the run loads more images than there are."""
         data = self.dataset
         photographs = self.photographs("train")
         subjects = self.subjects("train")
@@ -188,7 +181,7 @@ class PhotographsDataModule(LightningDataModule):
         drawn = batches * data.batch_size * (max(self.views.training_counts) + self.targets.per_step)
         views = tuple(sorted({RING_VIEW, *self.targets.training_views}))
         writes = drawn > sum(map(len, subjects.values())) * len(views)
-        # Photographs that are resized in each step are packed as they are stored.
+        # With varying sizes images are resized in each step, so they are packed at their stored size.
         varies = self.augmentation.varies_sizes
         sizes = (None,) if varies else dict.fromkeys((photographs.size, photographs.target_size))
         packs = {}
@@ -200,13 +193,12 @@ class PhotographsDataModule(LightningDataModule):
         photographs.packs = {size: each for size, each in packs.items() if each.fit(data.packed_gb, announce)}
 
     def train_dataloader(self) -> DataLoader:
-        """Batches of one epoch, which continues where the last one ended."""
+        """Loader of one epoch, which continues where the last one ended."""
         subjects = self.subjects("train")
         world = self.trainer.world_size if self.trainer else 1
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(subjects) / (self.dataset.batch_size * world))
-        # Loading processes begin anew with each epoch,
-        # for which a GPU would wait where subjects are few.
+        # Workers restart with each epoch, for which a GPU would wait often if there are few subjects.
         length = self.dataset.steps_per_epoch or once * math.ceil(LEAST_STEPS / once)
         planned = count_planned_batches(self.trainer, length)
         self._use_packs(planned, rank)
@@ -224,13 +216,13 @@ class PhotographsDataModule(LightningDataModule):
         split: str = "val",
         batch_size: int | None = None,
     ) -> DataLoader:
-        """One fixed sample for each subject.
+        """Loader of one fixed sample per subject.
 
         Args:
-            views: number of inputs; None: the view protocol's.
-            targets: a protocol or its mapping, or several, whose targets follow one another in each
+            views: number of input views; None: the view protocol's.
+            targets: one or several protocols, or their mappings, whose targets are concatenated in each
                 sample; None: this module's.
-            split: name of the subjects' split.
+            split: name of the split.
             batch_size: samples of a batch; None: the data set's.
 
         Raises:
@@ -248,13 +240,13 @@ class PhotographsDataModule(LightningDataModule):
         views: int | None = None,
         targets: Targets | Sequence[Targets] | None = None,
     ) -> Batch:
-        """The sample of one subject; no other is read.
+        """Fixed sample of one subject, as a batch; other subjects are not read.
 
         Args:
             subject: name of the subject.
             split: its split.
-            views: number of inputs; None: the view protocol's.
-            targets: as for :meth:`evaluation_loader`, but None gives a batch without targets.
+            views: number of input views; None: the view protocol's.
+            targets: as for :meth:`evaluation_loader`, except that None gives a batch without targets.
         """
         protocols = [] if targets is None else _read_protocols(targets)
         available = {subject: self.subjects(split)[subject]}
@@ -263,7 +255,7 @@ class PhotographsDataModule(LightningDataModule):
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
     ) -> list[Sample]:
-        """Fixed samples, one for each subject, with the targets of all protocols one after another."""
+        """One fixed sample per subject, with the concatenated targets of all protocols."""
         data = self.dataset
         count = self.views.evaluation_count if views is None else views
         possible = [self._check_static(protocol) for protocol in protocols]
@@ -281,11 +273,10 @@ class PhotographsDataModule(LightningDataModule):
         return targets
 
     def workers(self, batches: float) -> int:
-        """Number of loading processes, by :func:`choose_workers` where ``data.workers``
-        is ``auto``.
+        """Number of workers, from :func:`choose_workers` if ``data.workers`` is ``auto``.
 
         Args:
-            batches: number of batches that are loaded; infinite where it is not known.
+            batches: number of batches to load; infinite if unknown.
         """
         if self.dataset.workers != "auto":
             return self.dataset.workers

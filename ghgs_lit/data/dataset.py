@@ -1,4 +1,4 @@
-"""Options of data sets: location, reading, batches, and what is kept where."""
+"""Options of data sets: location, image sizes, batches and caches."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -19,15 +19,15 @@ if TYPE_CHECKING:  # the module imports Lightning, which takes seconds
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:
-    """Path configured at a key, which need not exist.
+    """Path configured by a key; it need not exist.
 
     Args:
-        key: of the configuration, for the message.
-        expected: what the folder is, for the message.
-        value: of the key.
+        key: key of the configuration, for the message.
+        expected: description of the folder, for the message.
+        value: value of the key.
 
     Raises:
-        InputError: it is null.
+        InputError: the value is null.
     """
     if value is None:
         raise InputError(f"{key}: expected {expected}; found null")
@@ -35,25 +35,25 @@ def required_folder(key: str, expected: str, value: str | None) -> Path:
 
 
 class Limit(Options):
-    """Numbers of subjects."""
+    """Limits on the numbers of subjects."""
 
     train: Count | None = None
-    """Subjects of training that are used, the first ones; null: all."""
+    """Use only this number of training subjects, the first ones; null: all."""
     val: Count | None = None
-    """Subjects of validation that are used, the first ones; null: all."""
+    """Use only this number of validation subjects, the first ones; null: all."""
 
     def of(self, phase: str) -> int | None:
-        """Number of subjects of a phase; None: all."""
+        """Maximum number of subjects of a phase; None: all."""
         return getattr(self, phase, None)
 
 
 class DataOptions(Options):
-    """Base options of data sets, which build their data module.
+    """Base class for options of data sets, which builds the data module.
 
     Attributes:
         published: number of people of each phase in the publication, if any.
-        static_cameras: whether there are no views between the cameras (view numbers are 0).
-        ring: number of positions on a full ring of cameras, among which inputs are evenly spaced.
+        static_cameras: whether the data has no views between the cameras (all view numbers are 0).
+        ring: number of positions of a full ring of cameras, on which inputs are evenly spaced.
     """
 
     group = "data"
@@ -66,29 +66,29 @@ class DataOptions(Options):
     size: Size
     """Side or [height, width] of the inputs in pixels."""
     target_size: Size | None = None
-    """Side or [height, width] of the targets in pixels; null: as size."""
+    """Side or [height, width] of the targets in pixels; null: same as size."""
     resampling: Literal["area", "release"] = "area"
-    """area: means over exact areas, everything stays at its place. release: as the authors' code
-    reads (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
+    """Method of resizing. area: means over exact areas, which shifts nothing. release: as in the authors'
+    code (Pillow's bicubic filter for images, OpenCV's nearest neighbour for masks)."""
     batch_size: int = Field(1, ge=1, le=1024)
-    """Samples of one step in each process, all in memory at once: at most 1024."""
+    """Samples of a step in each process, all in memory at once; at most 1024."""
     class_steps: Count = 1
-    """Training batches in a row with equal sizes of photographs and targets, number of views,
-    entry of token_budgets and number of rounds: the CUDA graph that is captured in the first two of
-    them is replayed in the others."""
+    """Number of consecutive training batches with equal image and target sizes, number of views, entry of
+    token_budgets and number of rounds. The CUDA graph captured in the first two is replayed in the
+    others."""
     steps_per_epoch: Count | None = None
-    """Training steps of an epoch; null: whole passes over the subjects, 100 steps or more."""
+    """Training steps of an epoch; null: whole passes over the subjects, at least 100 steps."""
     cache_images_mb: Amount = 512
-    """MiB of decoded photographs kept in memory by each process."""
+    """Memory in MiB in which each process caches decoded images."""
     packed_gb: Amount = 16
-    """Largest size in GB (10^9 bytes) of the decoded photographs of training that are kept on the
-    disk, in the data's folder or the user's cache, and mapped into memory; 0: none are."""
+    """Maximum size in GB (10^9 bytes) of decoded training images on disk, in the data's folder or the
+    user's cache, from which they are memory-mapped; 0: none."""
     evaluation_positions: tuple[tuple[Index, ...], ...] = ()
-    """Lists of input positions, such as [[0, 6, 11]] for 3 views;
-    other numbers of views: evenly spaced."""
+    """Lists of input positions for evaluation, such as [[0, 6, 11]] for 3 views; other numbers of views
+    are evenly spaced."""
     workers: Workers | Literal["auto"] = "auto"
-    """Loading processes of each process that trains; 0: none;
-    auto: by cores, devices and batches."""
+    """Loading processes per training process; 0: none; auto: chosen from the numbers of cores, devices
+    and batches."""
 
     def build(
         self,
@@ -97,29 +97,24 @@ class DataOptions(Options):
         seed: int = 0,
         augmentation: "Augmentation | Mapping[str, Any] | None" = None,
     ) -> "PhotographsDataModule":
-        """The data module of these options.
-
-        Args:
-            views: choice of the inputs.
-            targets: choice of the targets.
-            seed: of all random numbers.
-            augmentation: variation of training batches; None: none.
-        """
+        """Build the data module; arguments as for
+        :class:`~ghgs_lit.data.datamodule.PhotographsDataModule`."""
         from ghgs_lit.data.datamodule import PhotographsDataModule
 
         return PhotographsDataModule(self, views, targets, seed, augmentation)
 
     @abstractmethod
     def reader(self, phase: str, strict: bool = True) -> Reader:
-        """Reader of a split.
+        """Create the reader of a split.
 
         Args:
             phase: name of the split.
-            strict: raise the first problem of the data, or collect all, as for :class:`Reader`.
+            strict: whether to raise the first problem of the data or to collect all, as in
+                :class:`Reader`.
         """
 
     def has(self, phase: str) -> bool:
-        """Whether a phase has subjects; data without ``train`` can be evaluated."""
+        """Whether a phase has subjects; data without ``train`` can still be evaluated."""
         return True
 
     @property
@@ -128,31 +123,24 @@ class DataOptions(Options):
         return PHASES
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Make missing data; called once, before any process reads.
-
-        Args:
-            splits: names of the splits whose data is made.
-        """
+        """Create missing data of splits; called once, before any process reads."""
         return
 
     def make(self) -> None:
-        """Make all data that can be made (``ghgs prepare task=render``)."""
+        """Create all data that can be created (``ghgs prepare task=render``)."""
         self.prepare()
 
     def check_targets(self, targets: TargetProtocol) -> None:
-        """Reject a target protocol whose views this data set never has.
-
-        Args:
-            targets: the protocol.
+        """Reject a target protocol.
 
         Raises:
-            InputError: it requires such views.
+            InputError: it requires views that the data set cannot have.
         """
         return
 
     @property
     def folder(self) -> Path:
-        """Folder of the data, ``root`` of a subclass.
+        """Folder of the data, the ``root`` of a subclass.
 
         Raises:
             InputError: ``data.root`` is null or not a folder.
@@ -163,7 +151,7 @@ class DataOptions(Options):
 
     @property
     def facts(self) -> dict[str, str]:
-        """Provenance of the files for results."""
+        """Provenance of the data for results."""
         return {"name": self.name}
 
     def split_facts(self, split: str) -> dict[str, str]:
@@ -172,9 +160,9 @@ class DataOptions(Options):
 
 
 class DataSet(DataOptions):
-    """Options of a data set in the user's folder."""
+    """Options of a data set that the user has downloaded."""
 
     root: PathText | None = None
     """Folder of the data."""
     limit: Limit = Limit()
-    """Subjects used of each phase."""
+    """Maximum number of subjects of each phase."""

@@ -1,5 +1,4 @@
-"""Decoding and checking of files of data sets;
-an :class:`InputError` names the file of a defect."""
+"""Decoding and checking of files of data sets. Every :class:`InputError` names the file."""
 
 import re
 from collections.abc import Sequence
@@ -13,11 +12,11 @@ from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import read_npy
 
-# Largest distance of a principal point from the image's centre, as a fraction of the side.
+# Maximum distance of a principal point from the image's centre, as a fraction of the side.
 _OFF_CENTRE = 0.25
-# Largest entry of ``R R^T - I``: allows rounding, but no other unit or axis.
+# Maximum entry of ``R R^T - I``: allows for rounding, but not for a scale or a wrong axis.
 _ROTATION_TOLERANCE = 1e-3
-#: Largest coordinate of a vertex: a kilometre in millimetres.
+#: Maximum coordinate of a vertex: one kilometre in millimetres.
 _FURTHEST = 1e6
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
@@ -25,22 +24,22 @@ Shapes = Sequence[tuple[int | None, ...]]
 
 
 def read_photograph(path: Path) -> np.ndarray:
-    """Read a photograph.
+    """Read a colour image.
 
     Args:
-        path: of an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha ignored).
+        path: image with 8 bits per channel: grey, palette, RGB or CMYK; alpha is ignored.
 
     Returns:
         [h, w, 3] uint8 in sRGB.
 
     Raises:
-        InputError: it is missing or cannot be decoded, has other values, or is turned by its EXIF
+        InputError: the file is missing or cannot be decoded, has other values, or is rotated by its EXIF
             orientation.
     """
     image = read_image(path)
     turn = orientation_of(image, path)
     if turn != UPRIGHT:
-        # Programs disagree on whether a calibration belongs to the stored or to the turned pixels.
+        # Programs differ in whether a calibration refers to the stored or to the rotated pixels.
         raise InputError(
             f"{path}: expected a photograph that is stored as it is shown (its mask and camera fit "
             f"these pixels); found EXIF orientation {turn}"
@@ -52,14 +51,14 @@ def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Read channel 0 of a mask or depth map.
 
     Args:
-        path: of an image of whole numbers.
-        size: (height, width) of its photograph.
+        path: image with integer values.
+        size: (height, width) of the image to which it belongs.
 
     Returns:
-        [h, w] as stored.
+        [h, w] with the stored dtype.
 
     Raises:
-        InputError: it is missing, cannot be decoded, has another size, or does not hold integers.
+        InputError: the file is missing or cannot be decoded, has another size, or has no integers.
     """
     array = np.asarray(read_image(path))
     if array.dtype.kind not in "bui":
@@ -73,32 +72,26 @@ def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def read_array(path: Path, shapes: Shapes) -> np.ndarray:
-    """Read an ``.npy`` file.
+    """Read an ``.npy`` file as a finite float64 array.
 
     Args:
-        path: of the file.
-        shapes: as for :func:`check_array`.
-
-    Returns:
-        A finite float64 array.
+        path: the file.
+        shapes: see :func:`check_array`.
 
     Raises:
-        InputError: it is missing, or as for :func:`check_array`.
+        InputError: the file is missing; otherwise see :func:`check_array`.
     """
     return check_array(path, read_npy(path, f"an array {_describe(shapes)}"), shapes)
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """Read vertices of a body or scan.
-
-    Args:
-        path: of an ``.npy`` file.
+    """Read the vertices of a body or scan from an ``.npy`` file.
 
     Returns:
         [n, 3] float32, n >= 1.
 
     Raises:
-        InputError: it is missing or another array, or a coordinate is beyond 1e6.
+        InputError: the file is missing or has another array, or a coordinate is 1e6 or more.
     """
     vertices = read_array(path, [(None, 3)])
     require(len(vertices) > 0, str(path), "vertices", "none")
@@ -107,10 +100,10 @@ def read_vertices(path: Path) -> np.ndarray:
 
 
 def check_extent(place: Path | str, vertices: np.ndarray) -> None:
-    """Refuse coordinates that no scan of a person has in any unit and that would dwarf all others.
+    """Reject coordinates that are implausible for a scan of a person in any unit.
 
     Args:
-        place: of the vertices, for the message.
+        place: file of the vertices, for the message.
         vertices: [n, 3].
 
     Raises:
@@ -121,12 +114,12 @@ def check_extent(place: Path | str, vertices: np.ndarray) -> None:
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
-    """Convert to a finite float64 array.
+    """Convert numbers to a finite float64 array.
 
     Args:
-        place: of the array, for the message.
-        array: numbers in any form that NumPy takes.
-        shapes: possible shapes, in which None is any length.
+        place: file of the array, for the message.
+        array: numbers in any form that NumPy accepts.
+        shapes: allowed shapes, in which None stands for any length.
 
     Raises:
         InputError: it is not an array of numbers, has another shape, or is not finite.
@@ -159,14 +152,14 @@ def _describe(shapes: Shapes) -> str:
 
 
 def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
-    """Intrinsics [3, 3] float64.
+    """Check intrinsics and convert them to [3, 3] float64.
 
     Args:
-        place: of the matrix, for the message.
+        place: file of the matrix, for the message.
         intrinsics: [3, 3] in pixels.
 
     Raises:
-        InputError: not finite, focal lengths not above 0, or last row not 0 0 1.
+        InputError: a value is not finite, a focal length is not positive, or the last row is not 0 0 1.
     """
     intrinsics = check_array(place, intrinsics, [(3, 3)])
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
@@ -178,14 +171,15 @@ def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
 
 
 def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
-    """Extrinsics [4, 4] float64.
+    """Check extrinsics and convert them to [4, 4] float64.
 
     Args:
-        place: of the matrix, for the message.
+        place: file of the matrix, for the message.
         extrinsics: [3, 4] or [4, 4], world to camera.
 
     Raises:
-        InputError: not finite, or not a proper rotation.
+        InputError: a value is not finite, the first three columns are not a proper rotation, or the last
+            row is not 0 0 0 1.
     """
     extrinsics = check_array(place, extrinsics, [(3, 4), (4, 4)])
     if len(extrinsics) == 3:
@@ -201,7 +195,7 @@ def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
 
 
 def _check_last_row(place: Path | str, matrix: np.ndarray) -> None:
-    """Refuse a camera's matrix that is transposed or scaled as a whole."""
+    """Reject a camera matrix that is transposed or scaled as a whole."""
     expected = np.eye(len(matrix))[-1]
     if np.abs(matrix[-1] - expected).max() > 1e-6:
         raise InputError(
@@ -210,11 +204,11 @@ def _check_last_row(place: Path | str, matrix: np.ndarray) -> None:
 
 
 def check_view(place: Path | str, view: View) -> None:
-    """Check shapes, types and camera of a :class:`View`.
+    """Check the shapes, dtypes and camera of a :class:`View`.
 
     Args:
-        place: of the photograph, for the message.
-        view: as a reader gives it.
+        place: name of the image, for the message.
+        view: result of a reader.
 
     Raises:
         InputError: an array or the camera is wrong.
@@ -237,13 +231,13 @@ def check_view(place: Path | str, view: View) -> None:
 
 
 def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
-    """Refuse a photograph that was resized after its calibration.
+    """Reject an image that was resized after its calibration.
 
     Args:
-        path: of the photograph, for the message.
+        path: the image, for the message.
         intrinsics: [3, 3] in pixels.
-        height: of the photograph in pixels.
-        width: of the photograph in pixels.
+        height: height of the image in pixels.
+        width: width of the image in pixels.
 
     Raises:
         InputError: the principal point is farther from the centre than a quarter of a side.
@@ -256,13 +250,10 @@ def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) ->
 
 
 def check_name(name: str) -> str:
-    """Return ``name`` if it can be part of a file name, as results are named after subjects.
-
-    Args:
-        name: of a subject.
+    """Return a subject's name if it can be part of a file name, as results are named after subjects.
 
     Raises:
-        InputError: it has other characters than letters, digits and ``. + - _``.
+        InputError: the name has characters other than letters, digits and ``. + - _``.
     """
     require(bool(_SAFE_NAME.fullmatch(name)), "subject", "letters, digits and . + - _ only", name)
     return name

@@ -1,4 +1,4 @@
-"""Frames of sequences before the static cameras of a studio."""
+"""Frames of sequences that were captured by the static cameras of a studio."""
 
 import logging
 from abc import abstractmethod
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 def check_frames(options: Options) -> None:
-    """Refuse a range ``options.frames`` without frames.
+    """Reject an empty range ``options.frames``.
 
     Raises:
         InputError: start is not below stop.
@@ -39,12 +39,12 @@ def check_frames(options: Options) -> None:
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera as OpenCV has it.
+    """A calibrated camera in OpenCV's conventions.
 
     Attributes:
         intrinsics: [3, 3] in pixels, with pixel centres at integers.
         extrinsics: [4, 4], world to camera, metres.
-        distortion: k1 k2 p1 p2 (k3), which are removed from photographs; None: nothing is removed.
+        distortion: coefficients k1 k2 p1 p2 (k3), by which images are undistorted; None: they are not.
     """
 
     intrinsics: np.ndarray
@@ -53,15 +53,15 @@ class Camera:
 
 
 def read_camera(place: str, values: Mapping[str, Any], unit: float = 1.0) -> Camera:
-    """Check a camera of OpenCV.
+    """Check and convert a camera of OpenCV.
 
     Args:
-        place: of the camera, for messages.
+        place: file of the camera, for messages.
         values: K (3, 3), R (3, 3) and T (3), world to camera.
-        unit: of T in metres.
+        unit: unit of T in metres.
 
     Raises:
-        InputError: a value is missing or bad.
+        InputError: a value is missing or wrong.
     """
     for name in ("K", "R", "T"):
         if not isinstance(values, Mapping) or name not in values:
@@ -73,7 +73,7 @@ def read_camera(place: str, values: Mapping[str, Any], unit: float = 1.0) -> Cam
 
 
 def spread(cameras: Sequence[Camera]) -> float:
-    """Largest distance of a camera from the first one in metres."""
+    """Largest distance in metres of a camera from the first one."""
     centers = np.stack([-one.extrinsics[:3, :3].T @ one.extrinsics[:3, 3] for one in cameras])
     return float(np.linalg.norm(centers - centers[0], axis=-1).max())
 
@@ -83,11 +83,11 @@ class Frame:
     """A frame of a sequence.
 
     Attributes:
-        folder: of the sequence.
-        number: of the frame, in names of files.
-        cameras: all of the sequence.
-        positions: numbers of the cameras that are read.
-        photographs: path of each camera's photograph in ``folder``.
+        folder: folder of the sequence.
+        number: number of the frame in file names.
+        cameras: all cameras of the sequence.
+        positions: indices of the cameras that are read.
+        photographs: path of each camera's image, relative to ``folder``.
     """
 
     folder: Path
@@ -98,22 +98,21 @@ class Frame:
 
 
 class FrameReader(Reader):
-    """Reader whose subjects are frames, named ``<sequence>_<frame number>``; positions are cameras.
-
-    Missing sequences are left out.
+    """Base reader whose subjects are frames, named ``<sequence>_<frame number>``, and whose positions are
+    cameras. Missing sequences are skipped.
 
     Args:
         data: options of the data set.
         phase: ``train`` or ``val``.
-        sequences: names and wanted frames.
+        sequences: name and requested frames of each sequence.
         example: name of a sequence, for messages.
-        strict: raise the first problem of the data, or collect all.
+        strict: whether to raise the first problem of the data or to collect all.
 
     Raises:
         InputError: all sequences are missing, or one is bad.
     """
 
-    #: File of a sequence with its cameras.
+    #: File of a sequence that contains its cameras.
     calibration: ClassVar[str]
 
     def __init__(
@@ -140,26 +139,26 @@ class FrameReader(Reader):
 
     @abstractmethod
     def frames_of(self, folder: Path, wanted: range) -> list[Frame]:
-        """The wanted frames that a sequence has.
+        """Find the requested frames of a sequence.
 
         Args:
-            folder: of the sequence.
-            wanted: numbers of frames.
+            folder: folder of the sequence.
+            wanted: numbers of the requested frames.
 
         Raises:
-            InputError: cameras are bad, or there is no such frame.
+            InputError: a camera is bad, or none of the frames exists.
         """
 
     @abstractmethod
     def photograph(self, frame: Frame, position: int) -> Path:
-        """File of a photograph, whether it is there or not."""
+        """Path of an image, which need not exist."""
 
     @abstractmethod
     def masks(self, frame: Frame, position: int) -> list[Path]:
-        """Files whose union is the mask of a photograph: any value but 0 is the subject."""
+        """Files whose union is the mask of an image; all values except 0 are the subject."""
 
     def body_files(self, frame: Frame) -> Sequence[Path]:
-        """Files that a frame's body depends on; the first is its own."""
+        """Files on which a frame's body depends, first the frame's own file."""
         return ()
 
     @property
@@ -167,14 +166,8 @@ class FrameReader(Reader):
         return len({frame.folder for frame in self.frames.values()})
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """See :meth:`Reader.read_view`; the background is black.
-
-        Args:
-            name: of the subject.
-            position: number of the camera.
-            view: not used; there are no views between cameras.
-            depth: not used; no depth maps are read.
-        """
+        """Read an image on black, see :meth:`Reader.read_view`. There are no views between cameras and no
+        depth maps: ``view`` and ``depth`` are not used."""
         frame = self.frames[name]
         path = self.photograph(frame, position)
         image = read_photograph(path)

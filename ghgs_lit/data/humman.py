@@ -1,11 +1,14 @@
 """Options and reader of HuMMan-Recon v1.0.
 
-``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of
-6 (some are missing), ``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with
-the same names (matting: any value but 0 is the performer), for the test sequences
-``kinect_mask_manual/``, ``smpl_params/<frame>.npz`` and ``cameras.json``: ``K`` (3, 3), ``R``
-(3, 3) and ``T`` (3) of each ``kinect_color_<k>`` as in OpenCV, world to camera in metres, without
-lens distortion.
+``<root>/p<subject>_a<action>/`` contains, for the Kinects 000 to 009 and frames that are multiples of 6
+(some are missing)::
+
+    kinect_color/kinect_<k>/<frame>.png   images, 1920 x 1080
+    kinect_mask/kinect_<k>/<frame>.png    masks from matting: all values except 0 are the performer
+    kinect_mask_manual/                   likewise, for the test sequences only
+    smpl_params/<frame>.npz               parameters of the SMPL body
+    cameras.json                          for each ``kinect_color_<k>`` K (3, 3), R (3, 3) and T (3) as in
+                                          OpenCV, world to camera, metres, without lens distortion
 """
 
 import logging
@@ -28,23 +31,20 @@ from ghgs_lit.parsing import find_path, read_json
 log = logging.getLogger(__name__)
 
 KINECTS = range(10)
-# Metres: least and greatest plausible distance between cameras of one studio.
+# Smallest and largest plausible distance in metres between the cameras of a studio.
 _NEAREST = 0.1
 _FURTHEST = 100.0
 _SEQUENCE = re.compile(r"p\d{6}_a\d{6}")
 
-#: Folder of the photographs.
+#: Folder of the images.
 _COLOR = "kinect_color"
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the ten colour cameras of a sequence.
-
-    Args:
-        path: of ``cameras.json``.
+    """Read the ten colour cameras of a sequence from its ``cameras.json``.
 
     Raises:
-        InputError: the file or a camera is missing or bad, or translations are not in metres.
+        InputError: the file or a camera is missing or wrong, or translations are not in metres.
     """
     content = read_json(path, "the cameras of a sequence in JSON")
     cameras = []
@@ -58,7 +58,7 @@ def read_cameras(path: Path) -> list[Camera]:
 
 
 class HuMManReader(FrameReader):
-    """Frames of HuMMan; missing frames and cameras of a frame are left out."""
+    """Reader of HuMMan frames; missing frames, and missing cameras of a frame, are skipped."""
 
     calibration = "cameras.json"
 
@@ -121,13 +121,13 @@ class SequenceNames(Options):
     """Sequences of each phase."""
 
     train: tuple[Text, ...] | None = None
-    """Names of sequences; null: all that exist but those of val."""
+    """Names of sequences; null: all that exist except those of val."""
     val: tuple[Text, ...] = Field(min_length=1)
     """Names of sequences."""
 
 
 class HuMMan(DataSet):
-    """Downloaded HuMMan-Recon sequences below ``root``; a subject is one frame of one sequence."""
+    """Downloaded HuMMan-Recon sequences below ``root``; each frame of a sequence is a subject."""
 
     published: ClassVar[Mapping[str, int]] = {"train": 317, "val": 22}
     static_cameras: ClassVar[bool] = True
@@ -138,12 +138,12 @@ class HuMMan(DataSet):
     split: SequenceNames
     """Sequences of each phase."""
     frames: tuple[Index, Index, Count] = (0, 97, 6)
-    """[start, stop, step] of frame numbers; those that a sequence lacks are left out."""
+    """[start, stop, step] of frame numbers; frames that a sequence lacks are skipped."""
     masks: Literal["kinect_mask", "kinect_mask_manual"] = "kinect_mask"
-    """Folder of masks; kinect_mask_manual is there for the test sequences only."""
+    """Folder of masks; kinect_mask_manual exists for the test sequences only."""
     smpl_model: options.PathText | None = None
-    """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl: its vertices are the
-    bodies. It needs the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""
+    """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl, whose vertices are the
+    bodies; requires the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""
 
     @model_validator(mode="after")
     def _check(self) -> "HuMMan":
@@ -151,7 +151,7 @@ class HuMMan(DataSet):
         return self
 
     def sequences(self, phase: str) -> list[str]:
-        """Names of the sequences of a phase; listed ones need not exist."""
+        """Names of the sequences of a phase; configured ones need not exist."""
         if (names := getattr(self.split, phase)) is not None:
             return list(names)
         names = (p.name for p in self.folder.iterdir() if p.is_dir() and _SEQUENCE.fullmatch(p.name))

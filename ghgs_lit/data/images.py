@@ -1,5 +1,4 @@
-"""Opening of images: which formats, the colours that their profile means,
-and how they are turned."""
+"""Decoding of images: formats, colour profiles and EXIF orientation."""
 
 import contextlib
 import functools
@@ -15,35 +14,31 @@ from PIL import ExifTags, Image
 from ghgs_lit.errors import InputError
 from ghgs_lit.parsing import require_file
 
-if TYPE_CHECKING:  # most photographs have no profile
+if TYPE_CHECKING:  # most images have no profile
     from PIL import ImageCms
 
-#: Formats that are opened, by content: each is decoded in this process. Pillow knows others, and
-#: starts a program of the system for some of them (EPS: Ghostscript).
+#: Formats that are opened, recognised by their content, all decoded in this process. For some of its
+#: other formats Pillow would start a program of the system (EPS: Ghostscript).
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "GIF", "JPEG2000", "PPM", "TGA")
-#: Modes that convert to RGB without loss of range.
+#: Pillow's modes that convert to RGB without loss of range.
 EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
-UPRIGHT = 1  #: The EXIF orientation of images that are stored as they are shown
-# Colour spaces of profiles: the mode that they describe, and modes that convert to it.
-# Palettes are of RGB.
+UPRIGHT = 1  #: EXIF orientation of images that are stored as displayed
+# By the colour space of a profile: the mode that it describes, and the modes that convert to it.
+# Palettes are RGB.
 _SPACES = {
     "RGB": ("RGB", ("RGB", "RGBA", "RGBX", "P", "PA", "YCbCr", "1", "L", "LA")),
     "GRAY": ("L", ("1", "L", "LA")),
     "CMYK": ("CMYK", ("CMYK",)),
 }
-# Levels by which a profile of sRGB may differ from LittleCMS's:
-# each of two conversions rounds once.
+# Maximum difference in levels between an sRGB profile and LittleCMS's: two conversions round once each.
 _ROUNDING = 2
 
 
 def read_image(path: Path) -> Image.Image:
-    """Decode an image of :data:`FORMATS`.
-
-    Args:
-        path: of the file; the format follows from its content.
+    """Decode an image in one of :data:`FORMATS`, recognised by its content.
 
     Raises:
-        InputError: it is missing or cannot be decoded.
+        InputError: the file is missing or cannot be decoded.
     """
     require_file(path, "an image")
     try:
@@ -56,7 +51,7 @@ def read_image(path: Path) -> Image.Image:
 
 @contextlib.contextmanager
 def listed_formats() -> Iterator[None]:
-    """Inside, Pillow opens images of :data:`FORMATS` alone, also where a library opens them."""
+    """Context in which Pillow opens only images in :data:`FORMATS`, also when other libraries call it."""
     Image.init()
     known = list(Image.ID)
     Image.ID[:] = [name for name in FORMATS if name in Image.OPEN]
@@ -67,14 +62,14 @@ def listed_formats() -> Iterator[None]:
 
 
 def orientation_of(image: Image.Image, path: Path) -> int:
-    """The EXIF orientation, 1 to 8 (CIPA DC-008).
+    """EXIF orientation of an image, 1 to 8 (CIPA DC-008).
 
-    Any other value, such as 0, means unknown: viewers show such images as they are
-    stored. A warning where EXIF data is damaged.
+    Any other value, such as 0, means unknown and gives 1, as viewers show such images as stored.
+    Damaged EXIF data gives a warning.
 
     Args:
-        image: as opened.
-        path: for the warning.
+        image: the opened image.
+        path: its file, for the warning.
     """
     try:
         orientation = image.getexif().get(ExifTags.Base.Orientation, UPRIGHT)
@@ -85,20 +80,20 @@ def orientation_of(image: Image.Image, path: Path) -> int:
 
 
 def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
-    """Colours in sRGB of a photograph, alpha ignored.
+    """Convert an image to sRGB; alpha is ignored.
 
-    An embedded profile, such as Display P3 or a linear one, is applied by LittleCMS. A warning
-    where it cannot be read or is of other pixels: colours are taken as sRGB.
+    LittleCMS applies an embedded profile, such as Display P3 or a linear one. A profile that is damaged
+    or describes other pixels gives a warning, and colours are taken as sRGB.
 
     Args:
-        image: as opened.
-        path: for messages.
+        image: the opened image.
+        path: its file, for messages.
 
     Returns:
         [h, w, 3] uint8.
 
     Raises:
-        InputError: the image has not 8 bits a channel (:data:`EIGHT_BITS`).
+        InputError: the image does not have 8 bits per channel (:data:`EIGHT_BITS`).
     """
     if image.mode not in EIGHT_BITS:
         raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
@@ -116,8 +111,8 @@ def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _to_srgb(profile: bytes, mode: str) -> "tuple[str, ImageCms.ImageCmsTransform | None]":
-    """Mode that an ICC profile describes, and the transform to sRGB (None: the identity); ValueError: the
-    profile is of other pixels."""
+    """Mode that an ICC profile describes, and the transform to sRGB (None: the identity); raises
+    ValueError if the profile describes other pixels."""
     from PIL import ImageCms
 
     opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
@@ -128,7 +123,7 @@ def _to_srgb(profile: bytes, mode: str) -> "tuple[str, ImageCms.ImageCmsTransfor
     transform = ImageCms.buildTransform(opened, ImageCms.createProfile("sRGB"), described, "RGB")
     if described == "CMYK":
         return described, transform
-    # All combinations of 18 levels.
+    # All combinations of 18 levels per channel.
     levels = np.arange(0, 256, 15, np.uint8)
     colors = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(1, -1, 3)
     probe = Image.fromarray(colors if described == "RGB" else np.arange(256, dtype=np.uint8)[None])

@@ -1,7 +1,6 @@
-"""Imperfections of captures: exposure and colour of single cameras, masks, calibration,
-cut subjects.
+"""Imperfections of captures: exposure and colour of single cameras, masks, calibration, cut subjects.
 
-The number of random numbers that a function draws does not depend on its limits.
+The count of random numbers that a function samples does not depend on its limits.
 """
 
 import dataclasses
@@ -20,26 +19,26 @@ from ghgs_lit.geometry.projection import look_at_point, project, unproject
 from ghgs_lit.geometry.rotations import after_motions, motions_between, quaternion_to_matrix, without_common
 from ghgs_lit.types import Batch, Cameras
 
-# Stored colours are light to the power 1/2.2.
+# Stored colours are linear light to the power 1/2.2.
 _GAMMA = 2.2
 # Width of the bumps of a ragged outline in pixels.
 _BUMP = 6
-# Patches of backgrounds: number along a side and deviation of colours; noise of single pixels.
+# Patches of backgrounds: number along a side, and maximum deviation of their colours.
 _PATCHES = ((3, 0.35), (12, 0.15), (40, 0.06))
-_NOISE = 0.02
+_NOISE = 0.02  # standard deviation of single pixels
 
 
 def draw_color_gains(
     views: int, exposure: float, white_balance: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3"]:
-    """Random factors of stored colours, geometric mean 1 over cameras:
-    photographs show only differences.
+    """Sample factors of stored colours with a geometric mean of 1 over cameras, as images show only
+    differences between cameras.
 
     Args:
         views: number of cameras V.
-        exposure: greatest deviation of a camera in stops, at least 0.
-        white_balance: greatest deviation of red and of blue from green in stops, at least 0.
-        rng: source of the deviations.
+        exposure: maximum deviation of a camera in stops, at least 0.
+        white_balance: maximum deviation of red and of blue from green in stops, at least 0.
+        rng: random generator.
 
     Returns:
         Factors [V, 3] above 0.
@@ -52,12 +51,12 @@ def draw_color_gains(
 
 
 def draw_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
-    """Random powers of stored colours, geometric mean 1 over cameras.
+    """Sample powers of stored colours with a geometric mean of 1 over cameras.
 
     Args:
         views: number of cameras V.
-        gamma: greatest natural logarithm of a power, at least 0.
-        rng: source of the deviations.
+        gamma: maximum absolute natural logarithm of a power, at least 0.
+        rng: random generator.
     """
     deviation = rng.uniform(-1, 1, views)
     deviation -= deviation.mean()
@@ -67,12 +66,12 @@ def draw_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Floa
 def change_tones(
     images: Float[Tensor, "B V 3 h w"], alpha: Float[Tensor, "B V h w"] | None, powers: Float[Tensor, "B V"]
 ) -> Float[Tensor, "B V 3 h w"]:
-    """Raise the colours of each view to a power; multiplication by mattes is undone before.
+    """Raise the colours of each view to a power, without their multiplication by mattes.
 
     Args:
-        images: in [0, 1], multiplied by ``alpha`` if there is one.
-        alpha: mattes in [0, 1]; None: pixels are of the subject or black.
-        powers: above 0.
+        images: colours in [0, 1], premultiplied by ``alpha`` if given.
+        alpha: mattes in [0, 1]; None: pixels show either the subject or black.
+        powers: powers above 0.
     """
     powers = powers[..., None, None, None]
     if alpha is None:
@@ -89,18 +88,15 @@ def perturb_mask(
     hole_chance: float,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask with the errors of a segmentation; unchanged if nothing would be left of it.
+    """Add the errors of a segmentation to a mask; it stays unchanged if it would become empty.
 
     Args:
-        mask: [h, w] bool, true on the subject.
-        offset: greatest growth or shrinkage in pixels, at least 0.
-        ragged: greatest height of bumps of the outline in pixels, at least 0.
-        hole: greatest diameter of a missing round piece, over the subject's height.
+        mask: [h, w], true on the subject.
+        offset: maximum growth or shrinkage in pixels, at least 0.
+        ragged: maximum height of bumps of the outline in pixels, at least 0.
+        hole: maximum diameter of a missing round piece, as a fraction of the subject's height.
         hole_chance: probability of a missing piece, in [0, 1].
-        rng: source of the errors; as many numbers are sampled for all limits.
-
-    Returns:
-        Mask [h, w] bool.
+        rng: random generator.
     """
     grow, height, missing, size, place = rng.uniform(size=5)
     bumps = rng.uniform(-1, 1, [side // _BUMP + 2 for side in mask.shape])
@@ -129,13 +125,13 @@ def perturb_mask(
 def draw_backgrounds(
     views: int, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3 h w"]:
-    """Random background for each camera: cloudy patterns of large and small patches.
+    """Sample a background for each camera: cloudy patterns of large and small patches.
 
     Args:
         views: number of cameras V.
-        height: rows h of a photograph.
-        width: columns w of a photograph.
-        rng: source of the patterns.
+        height: image height h.
+        width: image width w.
+        rng: random generator.
 
     Returns:
         Colours [V, 3, h, w] float32 in [0, 1].
@@ -150,8 +146,7 @@ def draw_backgrounds(
 
 
 def _stretch(patches: Float[Tensor, "*batch m n"], height: int, width: int) -> Float[Tensor, "*batch h w"]:
-    """Patches interpolated linearly, the middles of the outer ones at the middles of the
-    outer pixels."""
+    """Interpolate patches bilinearly, with the centres of outer patches at the centres of outer pixels."""
     channels = patches.reshape(1, -1, *patches.shape[-2:])
     pixels = F.interpolate(channels, (height, width), mode="bilinear", align_corners=True)
     return pixels.reshape(*patches.shape[:-2], height, width)
@@ -160,23 +155,24 @@ def _stretch(patches: Float[Tensor, "*batch m n"], height: int, width: int) -> F
 def perturb_cameras(
     cameras: Cameras, masks: Bool[Tensor, "V H W"], pixels: float, rng: np.random.Generator
 ) -> Cameras:
-    """Cameras with errors: each is rotated, moved across its axis, and has another focal length.
+    """Add calibration errors to cameras: a rotation, a translation across the axis, and a change of the
+    focal length.
 
-    A camera's error, at most ``pixels``, is the motion of the corners of its mask's box (the
-    photograph's for an empty mask) at the subject's distance, root mean square. The common error of
-    all cameras is removed, because photographs show only differences between cameras.
+    A camera's error, at most ``pixels``, is the root mean square motion of the corners of its mask's
+    box (of the image for an empty mask) at the subject's distance. The common error of all cameras is
+    removed, because images show only differences between cameras.
 
     Args:
         cameras: true cameras [V].
-        masks: masks of the subject [V, H, W].
-        pixels: greatest error in pixels, above 0.
-        rng: source of the errors.
+        masks: masks of the subject.
+        pixels: maximum error in pixels, above 0.
+        rng: random generator.
 
     Returns:
         Cameras [V] of the same sizes and dtypes.
 
     Raises:
-        InputError: the point that the cameras look at is not before all of them.
+        InputError: the point that the cameras look at is not in front of all of them.
     """
     count = len(masks)
     directions = torch.from_numpy(rng.standard_normal((count, 6)))
@@ -189,7 +185,7 @@ def perturb_cameras(
     corners = _corners(masks)
 
     def moved(errors: Tensor) -> tuple[Tensor, Tensor]:
-        """Intrinsics and extrinsics after errors [V, 6], each about in pixels."""
+        """Intrinsics and extrinsics with errors [V, 6], which are approximately in pixels."""
         focal = lenses[:, 1, 1]
         half = max(cameras.height, cameras.width) / 2
         turn = errors[:, :3] / 2 / torch.stack((focal, focal, torch.full_like(focal, half)), -1)
@@ -204,15 +200,15 @@ def perturb_cameras(
     points = unproject(corners, distances[:, None].expand(-1, 4), _for_corners(lenses), _for_corners(poses))
 
     def seen(lens: Tensor, pose: Tensor) -> Tensor:
-        """Pixels of the corners, which far from the world's origin differ from ``corners``
-        by rounding."""
+        """Projections of the corners; far from the world's origin even those of the true cameras differ
+        from ``corners`` by rounding."""
         return project(points, _for_corners(lens), _for_corners(pose))[0]
 
     def size(lens: Tensor, pose: Tensor) -> Tensor:
         return (seen(lens, pose) - seen(lenses, poses)).square().sum(-1).mean(-1).sqrt()
 
     errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
-    for _ in range(3):  # the size is nearly proportional to the errors
+    for _ in range(3):  # converges fast, as the size is nearly proportional to the errors
         errors = errors * (wanted / size(*moved(errors)))[:, None]
     lens, pose = _remove_common_error(cameras, *moved(errors))
     largest = size(lens, pose).amax()
@@ -222,7 +218,7 @@ def perturb_cameras(
 
 
 def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
-    """Corners of the boxes around masks, in pixels; those of the photograph for an empty mask."""
+    """Corners of the boxes around masks in pixels; those of the image for an empty mask."""
     masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
     corners = []
     for mask in masks:
@@ -239,7 +235,7 @@ def _for_corners(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
 def _remove_common_error(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
-    """Float64 intrinsics and extrinsics without the common part of their differences from true cameras."""
+    """Remove the common part of the errors of cameras; returns float64 intrinsics and extrinsics."""
     true = cameras.extrinsics.double()
     middle = look_at_point(cameras).double()
     motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
@@ -250,21 +246,21 @@ def _remove_common_error(
     return lens, after_motions(true, motions, middle)
 
 
-#: Least and greatest share of a cut subject's height that remains: down to the waist or the ankles.
+#: Minimum and maximum share of a cut subject's height that remains: down to the waist or the ankles.
 _SHOWN = 0.45, 0.95
 
 
 def cut_subjects(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
     """Cut a share of the subjects by the frame's lower edge.
 
-    Half of them are cut in all inputs and targets at about the same height, so that no target
-    shows legs that no input shows; the others in some inputs, at different heights. Photographs
-    are moved down in their frames, and principal points with them.
+    Half of them are cut in all inputs and targets at about the same height, so that no target shows
+    legs that no input shows; the others in some inputs, at different heights. Images move down in their
+    frames, and principal points move with them.
 
     Args:
-        batch: of at least two views.
+        batch: a batch with at least two views.
         chance: share of the subjects that are cut, in [0, 1].
-        rngs: one for each element.
+        rngs: random generator of each element.
     """
     views = batch.masks.shape[1]
     shares = np.ones(batch.masks.shape[:2])
@@ -295,7 +291,7 @@ def cut_subjects(batch: Batch, chance: float, rngs: list[np.random.Generator]) -
 
 
 def _rows_down(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> Int[Tensor, "B V"]:
-    """Rows by which photographs move down so that the given share of the mask's height remains."""
+    """Rows by which images move down so that the given share of the mask's height remains."""
     moved = []
     for seen, share in zip(extents(masks.flatten(0, 1)), shares.flatten(), strict=True):
         end = math.ceil(seen.top + share * (seen.bottom - seen.top))
@@ -304,7 +300,7 @@ def _rows_down(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"])
 
 
 def _move_down(maps: Tensor | None, rows: Int[Tensor, "B V"]) -> Tensor | None:
-    """``maps`` [B, V, ..., H, W], each moved down by its rows, with zeros above."""
+    """Move each of ``maps`` [B, V, ..., H, W] down by its number of rows, with zeros above."""
     if maps is None:
         return None
     moved = torch.zeros_like(maps)
