@@ -1,4 +1,4 @@
-"""Rendered boxes, which all tests of measuring read."""
+"""Rendered boxes for all tests of evaluation."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from tests.helpers.people import render_boxes
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Images this small gain nothing from threads, and lose much where the cores are shared."""
+    """Run on one thread: small images gain nothing from more, and lose much where cores are shared."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -17,7 +17,7 @@ def one_thread():
 
 @pytest.fixture(scope="session")
 def boxes(tmp_path_factory):
-    """The root of three people to train on and two to measure."""
+    """Root of a data set with three people for training and two for validation."""
     folder = tmp_path_factory.mktemp("boxes")
     render_boxes(folder / "rendered", folder / "scans", train=3, val=2)
     return folder / "rendered"

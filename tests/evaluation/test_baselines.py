@@ -33,7 +33,7 @@ def test_the_nearest_view_is_the_one_beside_the_target(views):
     """The baseline copies the nearest camera on either side, also across the start of the ring."""
     batch = example_batch(subjects=2, views=views, targets=2)
     step = 2 * math.pi / views
-    # the first target stands beside view 2 on the far side, the second beside view 0
+    # the first target is next to view 2 on the far side, the second next to view 0
     near = dataclasses.replace(ring(2, 16))
     cameras = ring(1, 16, start=2 * step + 0.4 * step), ring(1, 16, start=-0.4 * step)
     near = dataclasses.replace(near, extrinsics=torch.cat([c.extrinsics for c in cameras]))
@@ -45,7 +45,7 @@ def test_the_nearest_view_is_the_one_beside_the_target(views):
 
 @pytest.mark.parametrize("size", [(8, 8), (4, 12), (32, 24)])
 def test_the_nearest_view_is_resized_as_photographs_are(size):
-    """As Pillow does it: a smaller copy averages what a pixel covers, a larger one interpolates."""
+    """As in Pillow, downsampling averages the area of a pixel, upsampling interpolates."""
     batch = example_batch(subjects=1, views=2, size=16)
     masks = torch.zeros(1, 1, *size, dtype=torch.bool)
     targets = dataclasses.replace(batch.targets, images=torch.zeros(1, 1, 3, *size), masks=masks)
@@ -56,7 +56,7 @@ def test_the_nearest_view_is_resized_as_photographs_are(size):
 
 
 def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
-    """Splats project back onto the centres of their own pixels, with the configured width."""
+    """Splats project to the centres of their pixels, with the configured width."""
     batch = example_batch(views=2)
     depth = torch.full(batch.masks.shape, 1.7)
     gaussians = splats_at(batch, depth, batch.masks, sigma=0.5, opacity=0.8)
@@ -83,7 +83,7 @@ def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
 
 @pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])
 def test_what_the_data_lacks_is_an_error(name, field):
-    """A baseline that the data cannot support is refused, as is an unknown name."""
+    """A baseline that the data cannot support is rejected, as is an unknown name."""
     batch = dataclasses.replace(example_batch(), **{field: None})
     with pytest.raises(InputError, match=name):
         named(name, nothing)(batch)
@@ -93,8 +93,7 @@ def test_what_the_data_lacks_is_an_error(name, field):
 
 @pytest.fixture(scope="module")
 def painted():
-    """A painted ellipsoid from other sides for each of two subjects,
-    and its targets of another size."""
+    """A painted ellipsoid from several sides for each of two subjects, with targets of another size."""
     cameras, seen = ring_around(2, 6, 32, 32), ring_around(2, 4, 40, 24)[:, 1:3]
     images, masks, depths = painted_ellipsoid(cameras)
     images[1] = 1 - images[1]
@@ -109,7 +108,7 @@ def painted():
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_every_baseline_predicts_the_targets(name, painted):
-    """Also of another size and number than the inputs, for several subjects, each from its own."""
+    """Targets may differ from inputs in size and number; each subject is predicted from its inputs."""
     truth, renderer = painted.targets.images, Renderer(backend="cpu")
     image = named(name, renderer if name != "untrained" else flat_renderer)(painted).image
     assert image.shape == truth.shape == (2, 2, 3, 40, 24)

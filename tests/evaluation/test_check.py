@@ -1,4 +1,4 @@
-"""What the end of a run needs is checked before its first step."""
+"""The requirements of the end of a run are checked before its first step."""
 
 import shutil
 
@@ -38,8 +38,7 @@ def check(root, *overrides):
     ],
 )
 def test_an_impossible_evaluation_is_refused_before_a_photograph_is_read(boxes, monkeypatch, said, refused):
-    """A run of days must not end without results because of a value that was wrong
-    from the start."""
+    """A run of days must not end without results because of a value that was wrong from the start."""
     monkeypatch.setattr(Photographs, "view", lambda *_: pytest.fail("a photograph was read"))
     check(boxes)
     with pytest.raises(InputError, match=refused):
@@ -47,8 +46,7 @@ def test_an_impossible_evaluation_is_refused_before_a_photograph_is_read(boxes, 
 
 
 def test_photographs_that_targets_lack_are_named(boxes, tmp_path):
-    """A protocol may ask for views that were never rendered,
-    or for a camera that one person lacks."""
+    """A protocol may require views that were never rendered, or a camera that one person lacks."""
     root = tmp_path / "rendered"
     shutil.copytree(boxes, root)
     for path in (root / "val" / "img").glob("*/3.jpg"):

@@ -30,7 +30,7 @@ OFF = MetricsOptions(lpips="off").build()
 
 @pytest.fixture(scope="module")
 def trained(boxes, tmp_path_factory):
-    """A run of three steps with everything on."""
+    """A run of three steps with all outputs."""
     directory = tmp_path_factory.mktemp("train") / "run"
     code = ghgs(
         "train", *data_of(boxes), "trainer.max_steps=3", "trainer.val_check_interval=2", "loss=depth",
@@ -71,7 +71,7 @@ def test_train_writes_everything_that_it_promises(trained):
 
 
 def test_a_checkpoint_measures_the_same_again_beside_the_baselines(trained, boxes, tmp_path):
-    """`ghgs evaluate` gives the numbers of the end of training."""
+    """`ghgs evaluate` reproduces the numbers of the end of training."""
     path = trained / "checkpoints" / "last.ckpt"
     code = ghgs(
         "evaluate", *data_of(boxes), f"checkpoint={path}", "baselines=all", "evaluation.views=[3]",
@@ -90,7 +90,7 @@ def test_a_checkpoint_measures_the_same_again_beside_the_baselines(trained, boxe
 
 
 def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_path):
-    """`metrics.json` describes the model that ran, on data and targets as they were said."""
+    """`metrics.json` describes the model that ran, on data and targets as given."""
     path = trained / "checkpoints" / "last.ckpt"
     code = ghgs(
         "evaluate", f"checkpoint={path}", "data.cache_images_mb=1", "targets=midway", "evaluation.views=[3]",
@@ -118,8 +118,7 @@ def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_p
 
 
 def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_path):
-    """One evaluation of shipped protocols and one of the user's,
-    none of which is selected by targets=."""
+    """One evaluation measures shipped protocols and a user-defined one, none of them selected by targets=."""
     mine = tmp_path / "conf" / "targets" / "mine.yaml"
     mine.parent.mkdir(parents=True)
     mine.write_text("defaults: [rogsplat, _self_]\nname: mine\npositions: [1, 4]\n")
@@ -145,8 +144,7 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
 
 
 def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes, tmp_path):
-    """A subject is predicted once for each number of views;
-    rows and pictures are those of each protocol."""
+    """A subject is predicted once for each number of views; each protocol has its rows and pictures."""
     views = {"training_counts": [3], "evaluation_count": 3}
     data = rendered(boxes, views, {"name": "release"}, size=42)
     protocols = {name: {"name": name} for name in ("midway", "release")}
@@ -180,7 +178,7 @@ def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes
 
 
 def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp_path):
-    """A subject becomes a PLY and pictures; an unknown subject is refused."""
+    """A subject becomes a PLY and pictures; an unknown subject is rejected."""
     path = trained / "checkpoints" / "last.ckpt"
     arguments = [
         *data_of(boxes),
@@ -196,8 +194,7 @@ def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp
 
 
 def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeypatch):
-    """A data set of thousands must not be read up to the subject;
-    targets are read where they are asked."""
+    """A large data set must not be read up to the subject; targets are read only on request."""
     read = []
     view = Photographs.view
 
@@ -218,7 +215,7 @@ def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeyp
 
 
 def test_two_processes_train_together_and_write_once(boxes, tmp_path):
-    """With several processes one of them writes, and the checkpoint loads."""
+    """Only one of several processes writes, and the checkpoint loads."""
     directory = tmp_path / "run"
     command = [
         sys.executable, "-m", "ghgs_lit", "train", *data_of(boxes), "trainer.devices=2",
@@ -240,7 +237,7 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
 
 
 def test_two_seeds_of_an_evaluation_differ_and_one_repeats(boxes, tmp_path):
-    """Random targets are those of the seed that is said."""
+    """Random targets depend on the given seed."""
     run = [
         "evaluate", *data_of(boxes), "baselines=[black]", "evaluation.views=[3]",
         "evaluation.targets=[random]", "evaluation.pictures=0",

@@ -1,4 +1,4 @@
-"""What is measured of a method: rows, depth errors, seconds, what is not finite."""
+"""Results of measuring a method: rows, depth errors, seconds, values that are not finite."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ OFF = MetricsOptions(lpips="off").build()
 
 
 def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
-    """Every number is found under its subject, target and inputs, with the value of the metric."""
+    """Every number has its subject, target and inputs, and the value of the metric."""
     batch = example_batch(subjects=2, views=3, targets=2)
     rows = measure(ModelMethod(Standin(), flat_renderer), "model", [batch], OFF, "cpu", tmp_path, 1)
     assert [(r["subject"], r["target"]) for r in rows] == [
@@ -35,7 +35,7 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
     pair = (picture[1, 1, :, top : bottom + 1, left : right + 1] for picture in (image, batch.targets.images))
     expected = psnr(*(part[None].clamp(0, 1) for part in pair)).item()
     assert rows[3]["psnr_box"] == pytest.approx(expected, abs=1e-4) != rows[3]["psnr"]
-    # the stand-in says 2.5 m, the truth is 2.1 m
+    # the stand-in predicts 2.5 m, the truth is 2.1 m
     assert rows[0]["depth_error_mm"] == pytest.approx(400, abs=1e-2)
     assert rows[0]["gaussians"] == 144
     assert rows[0]["surface_mm"] > 100
@@ -43,7 +43,7 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
 
 
 def test_what_is_not_finite_is_counted_and_named():
-    """No renderer draws it, and no depth error counts it."""
+    """Neither renderers nor depth errors include it."""
     batch = dataclasses.replace(make_batch(2, 3), subjects=("anna", "ben"))
     with torch.no_grad():
         prediction = predict(make_model("model=hull").eval(), batch)
@@ -69,7 +69,7 @@ def test_a_model_without_any_finite_depth_is_measured(model):
 
 
 def test_what_refines_takes_part_in_what_is_measured():
-    """Gaussians with the cameras that were corrected: neither is left out without a word."""
+    """Refined Gaussians and corrected cameras must not be omitted silently."""
     batch = example_batch()
     given = flat_renderer(Standin()(batch).gaussians, batch.targets.cameras).image
 
@@ -84,12 +84,12 @@ def test_what_refines_takes_part_in_what_is_measured():
         with torch.no_grad():
             estimate = method(batch)
         torch.testing.assert_close(estimate.image, given / share)
-        # Refined Gaussians have left the predicted depths.
+        # Refined Gaussians are not at the predicted depths.
         assert (estimate.depth is None) == (refinement is not None)
 
 
 def test_depth_errors_are_those_of_the_subject():
-    """Depths beside it are anything."""
+    """Depths outside the subject are arbitrary."""
     batch = example_batch(subjects=2)
     depth = torch.where(batch.masks, 2.1, 9.0)
     batch = dataclasses.replace(batch, depths=torch.full_like(depth, 2.1))
@@ -108,8 +108,7 @@ def test_seconds_are_those_of_a_subject(monkeypatch):
 
 
 def test_what_is_timed_searches_no_neighbors_of_the_other_setting(monkeypatch):
-    """Seconds of a prediction are its own; the share of neighbours that an ablation keeps
-    comes later."""
+    """Measured seconds exclude the share of neighbours that an ablation keeps, which is computed later."""
     searched, positions = [], Recalibration.positions
     monkeypatch.setattr(
         Recalibration,

@@ -30,7 +30,7 @@ RENDERER = Renderer(backend="cpu")
 
 
 def test_splats_have_the_surfaces_own_colors():
-    """A photograph with a matte is darker at the rim than the surface is; the splats are not."""
+    """Rims of an image with a matte are darker than the surface; the splats are not."""
     batch = with_soft_rims(make_batch(1, 2))
     valid = batch.masks & (batch.depths > 0)
     found = splats_at(batch, batch.depths, valid).colors
@@ -41,7 +41,7 @@ def test_splats_have_the_surfaces_own_colors():
 
 
 def test_discs_are_those_that_the_recurrent_model_starts_from():
-    """The model's own Gaussian head gives them for raw values of 0 at the same points."""
+    """The model's Gaussian head predicts the same discs for raw values of 0 at the same points."""
     run = run_of("train", ["model=recurrent"])
     head = run.gaussian_head.build(dim_latent=64)
     batch = with_matte(with_soft_rims(make_batch(2, 3)), run.model.matte)
@@ -74,7 +74,7 @@ def test_pixels_that_show_little_of_the_subject_have_discs_too():
 
 @pytest.mark.parametrize("splatting", [splats_at, discs_at])
 def test_sizes_are_of_each_views_own_focal_length(splatting):
-    """A lens of one view that is twice as long makes its splats half as wide, and no others."""
+    """Doubling the focal length of one view halves the size of its splats only."""
     batch = make_batch(2, 3)
     lenses = batch.cameras.intrinsics.clone()
     lenses[1, 2, [0, 1], [0, 1]] *= 2
@@ -85,14 +85,14 @@ def test_sizes_are_of_each_views_own_focal_length(splatting):
 
 
 def errors(views):
-    """Depths of the hull minus the true ones inside the silhouettes, in footprints of a pixel."""
+    """Depths of the hull minus the true ones inside the silhouettes, in pixel footprints."""
     batch = make_batch(views=views, height=160, width=160)
     difference = (hull_depth(batch) - batch.depths)[batch.masks]
     return difference * batch.cameras.intrinsics[0, 0, 0, 0] / batch.depths[batch.masks]
 
 
 def test_the_hull_of_a_convex_body_approaches_its_surface_with_more_views():
-    """A convex body is the intersection of its silhouette cones; few of them leave it too thick."""
+    """A convex body is the intersection of its silhouette cones; with few cones the hull is too thick."""
     few, many = errors(3), errors(24)
     assert many.max() < 0  # never behind the surface
     assert many.median() > -1.6  # masks are dilated by a pixel
@@ -107,8 +107,7 @@ def photographed(views=8, height=64, width=56):
 
 
 def test_colours_say_where_in_the_hull_the_surface_is():
-    """Nearer to the truth than the hull's front and than its middle,
-    on photographs that are not square."""
+    """Depths are closer to the truth than the hull's front and middle, on images that are not square."""
     batch = photographed()
     found, bounds = photo_depth(batch), batch.once(hull_bounds)
 
@@ -124,7 +123,7 @@ def test_colours_say_where_in_the_hull_the_surface_is():
 
 
 def test_a_body_of_one_colour_stands_between_the_ends_of_its_hull():
-    """No depth is better than another: what remains is a mean, not the first or a random one."""
+    """Where all depths are equally consistent the result is their mean, not the first or a random one."""
     batch = photographed(views=4)
     batch = Batch(0.5 * batch.masks[:, :, None].expand_as(batch.images), batch.masks, batch.cameras)
     bounds = batch.once(hull_bounds)
@@ -133,7 +132,7 @@ def test_a_body_of_one_colour_stands_between_the_ends_of_its_hull():
 
 
 def test_evidence_is_shared_inside_the_subject_only():
-    """A mean over the pixels of the mask in the window, by its definition."""
+    """The result is a mean over pixels of the mask in the window, by definition."""
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(2, 3, 4, 9, 7, generator=generator)
     masks = torch.rand(2, 3, 9, 7, generator=generator) > 0.4
@@ -146,7 +145,7 @@ def test_evidence_is_shared_inside_the_subject_only():
 
 
 def scene(views=4, size=42):
-    """Photographs of a painted ellipsoid, and its second input as the target."""
+    """Input views of a painted ellipsoid, with the second one as the target."""
     around = ring(1, 2 * views, size, size)
     images, masks, _ = painted_ellipsoid(around)
     own = Targets(images[:, 2:3], masks[:, 2:3], around[:, 2:3])
@@ -154,8 +153,7 @@ def scene(views=4, size=42):
 
 
 def test_the_photographs_are_fitted():
-    """The render of an input comes nearer to its photograph with steps,
-    far beyond what refinement may do."""
+    """Steps improve the render of an input by far more than refinement may."""
     batch = scene()
     method = PerScene(RENDERER, steps=40)
     begin = RENDERER(method.begin(batch), batch.targets.cameras).image
@@ -166,8 +164,8 @@ def test_the_photographs_are_fitted():
 
 
 def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
-    """The start is where photographs agree; position, rotation, scale,
-    opacity and colour all change."""
+    """Gaussians start at photo-consistent depths; position, rotation, scale, opacity and colour all
+    change."""
     batch = scene()
     method = PerScene(RENDERER, steps=3)
     begin = method.begin(batch)

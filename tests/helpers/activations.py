@@ -1,4 +1,4 @@
-"""All activations of published dense heads, of which the model needs one."""
+"""All activations of the published dense heads, of which the model uses one."""
 
 import torch
 import torch.nn.functional as F
@@ -37,7 +37,7 @@ CONFIDENCES = {"expp1": confidence_of, "expp0": torch.exp, "sigmoid": torch.sigm
 
 
 def split_activated(raw, value, confidence="expp1"):
-    """Activated values [n, h, w, c - 1] and confidence [n, h, w] of raw channels [n, c, h, w], the
-    last one for the confidence."""
+    """Activated values [n, h, w, c - 1] and confidence [n, h, w] (last channel) of raw channels [n,
+    c, h, w]."""
     raw = at_least_float32(raw).permute(0, 2, 3, 1)
     return VALUES[value](raw[..., :-1]), CONFIDENCES[confidence](raw[..., -1])

@@ -1,5 +1,4 @@
-"""A batch that shows the built-in body at rest:
-each pixel's depth is that of its nearest vertex."""
+"""A batch of the built-in body at rest: the depth of a pixel is that of its nearest vertex."""
 
 import torch
 
@@ -10,7 +9,7 @@ from tests.helpers.cameras import camera_ring
 
 
 def body_batch(batch=1, views=4, height=112, width=84, turn=20.0):
-    """The batch, and the vertex that each pixel shows [B, V, H, W], -1 for none."""
+    """The batch, and the vertex visible in each pixel [B, V, H, W], -1 for none."""
     body = load_body()
     vertices = torch.from_numpy(body.rest(body.bodies[0])[0][:BODY_VERTICES]).float()
     place = {"center": (0.0, 0.85, 0.0), "raised": 0.2, "radius": 2.5}

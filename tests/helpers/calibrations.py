@@ -1,4 +1,4 @@
-"""Calibrations on disk, as other programs write them."""
+"""Calibration files as written by other programs."""
 
 import json
 from pathlib import Path
@@ -14,13 +14,13 @@ LENS = [-0.35, 0.12, 0.001, -0.0005, 0.01]
 
 
 def write(path: Path, content: Any) -> Path:
-    """Write text, or anything else as JSON."""
+    """Write text, or any other content as JSON."""
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
 
 
 def one_camera(tmp_path: Path, **entries: Any) -> StoredCamera:
-    """A camera of OpenCV's matrices with further entries, as it is read."""
+    """Read a camera of OpenCV matrices with further entries from a file."""
     return read_cameras(write(tmp_path / "cameras.json", {"a": CAMERA | entries})).cameras["a"]
 
 
@@ -30,6 +30,6 @@ def frame(name: str, **entries: Any) -> dict[str, Any]:
 
 
 def transforms(tmp_path: Path, *frames: dict[str, Any], **entries: Any) -> Path:
-    """A file transforms.json."""
+    """Write a file transforms.json."""
     content = {"fl_x": 500, "cx": 320, "cy": 240, "w": 640, "h": 480, "frames": frames} | entries
     return write(tmp_path / "transforms.json", content)

@@ -23,7 +23,7 @@ def camera_ring(
     turn: float = 0.0,
     up: float = 1.0,
 ) -> Cameras:
-    """Cameras [batch, views] that stand around the y axis and look at ``center``.
+    """Cameras [batch, views] around the y axis that look at ``center``.
 
     Args:
         views, height, width, batch: number and image size of the cameras.
@@ -31,12 +31,13 @@ def camera_ring(
         principal: principal point in pixels; None: the middle of the image.
         radius: of the circle, in metres.
         center: of the circle, in metres.
-        raised: metres along y from the center to the circle.
-        start, spread: degrees of the first camera, and from it once around.
-        turn: degrees by which each element is turned against the one before.
+        raised: height of the circle above the center along y, in metres.
+        start: angle of the first camera, in degrees.
+        spread: angle of the whole ring, in degrees.
+        turn: rotation of each element against the previous one, in degrees.
         up: 1 where the world's y points up, -1 where it points down.
     """
-    # In float64 and rounded, so that distances and right angles are exact in float32.
+    # Float64 and rounding make distances and right angles exact in float32.
     middle = torch.tensor(center).double()
     extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
     for b in range(batch):

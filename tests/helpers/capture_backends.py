@@ -1,5 +1,4 @@
-"""A stand-in for CUDA graphs: it repeats the operators of a call at the places where the first
-one worked."""
+"""A stand-in for CUDA graphs that repeats the operators of a call in the memory of the captured one."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,15 +12,14 @@ from tests.helpers.pretend_device import DEVICE, PretendTensor
 
 
 class OperatorBackend:
-    """As CUDA graphs, for a type of ``device``;
-    ``recorded``: number of operators of each recording."""
+    """Like CUDA graphs, for devices of type ``device``; ``recorded``: number of operators of each capture."""
 
     def __init__(self, device: str = DEVICE.type):
         self.device = device
         self.recorded: list[int] = []
 
     def capture(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
-        call()  # as CUDA graphs need it: once before, with the same inputs
+        call()  # CUDA graphs require a warm-up with the same inputs
         with _Operators() as operators:
             result = call()
         self.recorded.append(len(operators.calls))
@@ -29,7 +27,7 @@ class OperatorBackend:
 
 
 class SilentBackend(OperatorBackend):
-    """Plays back nothing, as far as the host is concerned."""
+    """Replays do nothing on the host."""
 
     def capture(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
         return call(), lambda: None
@@ -50,12 +48,12 @@ class _Operators(TorchDispatchMode):
         for function, args, kwargs, result in self.calls:
             again = function(*args, **kwargs)
             if any(value.alias_info is not None for value in function._schema.returns):
-                continue  # a view, or what was written to, of memory that is filled by now
+                continue  # a view, or an output that was written in place
             for old, new in zip(_of(result), _of(again), strict=True):
                 old.copy_(new)
 
 
 def _of(result: Any) -> list[Tensor]:
-    """The values of a result's tensors, on the CPU."""
+    """Values of a result's tensors, on the CPU."""
     tensors = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
     return [tensor.inner if isinstance(tensor, PretendTensor) else tensor for tensor in tensors]

@@ -1,5 +1,4 @@
-"""Shared by the tests of data sets: miniatures made once, broken files,
-what a view must agree with."""
+"""Shared by the tests of data sets: cached miniatures, broken files, and checks of views."""
 
 import dataclasses
 import functools
@@ -27,7 +26,7 @@ _person = functools.lru_cache(figures.generate)
 
 
 def make_miniature(miniature, *arguments, **options) -> list[Path]:
-    """``miniature.make(...)`` of people that are generated once for all tests of a process."""
+    """``miniature.make(...)``, with people that are generated once per process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(miniature.figures, "generate", _person)
         return miniature.make(*arguments, **options)
@@ -39,7 +38,7 @@ def _config(*overrides: str):
 
 
 def build_data(name: str, root: Path, *overrides: str):
-    """The data module that the command line makes of ``data=<name> data.root=<root>``."""
+    """The data module of ``data=<name> data.root=<root>``."""
     cfg = _config(f"data={name}", *overrides)
     place = {} if any(o.startswith("data.root=") for o in overrides) else {"root": str(root)}
     node = OmegaConf.to_container(cfg.data, resolve=True) | place
@@ -63,8 +62,7 @@ def points_of(view: View) -> np.ndarray:
 
 
 def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> None:
-    """Check that photographs from packed files in ``folder`` are those of a reader,
-    to the bit."""
+    """Check that photographs from packed files in ``folder`` equal those of a reader bit by bit."""
     packed = Packs(reader, folder, size, "area", (0,), False)
     for name, positions in reader.subjects.items():
         assert packed.pack(name) is not None
@@ -76,15 +74,14 @@ def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> 
 
 
 class Malice:
-    """Runs a command when a pickle of it is read carelessly."""
+    """Runs a command if its pickle is loaded without restrictions."""
 
     def __reduce__(self):
         return os.system, ("touch ran",)
 
 
 def refused(line: str, read: Callable[[], object]) -> None:
-    """Check that ``read`` is refused with one line that matches,
-    and that no pickle ran in this folder."""
+    """Check that ``read`` raises InputError with one matching line, and that no pickle ran in this folder."""
     with pytest.raises(InputError, match=line) as caught:
         read()
     assert "\n" not in str(caught.value)
@@ -92,7 +89,7 @@ def refused(line: str, read: Callable[[], object]) -> None:
 
 
 def inside(view: View, points: np.ndarray) -> float:
-    """The share of world points that project into the view's mask, or onto a pixel beside it."""
+    """Share of world points that project into the view's mask, or onto a pixel next to it."""
     local = points @ view.extrinsics[:3, :3].T + view.extrinsics[:3, 3]
     pixels = local @ view.intrinsics.T
     columns, rows = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
@@ -103,15 +100,14 @@ def inside(view: View, points: np.ndarray) -> float:
 
 
 def blob(height: int, width: int, x: float, y: float, sigma: float = 3.0) -> np.ndarray:
-    """[h, w, 3] uint8: a spot at ``x``, ``y`` where pixel centres are integers,
-    as OpenCV has them."""
+    """[h, w, 3] uint8: a spot at ``x``, ``y``, with pixel centres at integers, as in OpenCV."""
     rows, columns = np.mgrid[:height, :width]
     spot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
     return np.repeat(np.round(255 * spot)[..., None], 3, -1).astype(np.uint8)
 
 
 def centroid(image: np.ndarray) -> np.ndarray:
-    """Where the light of an image is centred, x and y, pixel centres at +0.5."""
+    """Centroid x, y of an image's light, with pixel centres at +0.5."""
     weight = image[..., 0].astype(np.float64)
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
@@ -129,12 +125,12 @@ def truncate(path: Path, share: float = 0.5) -> None:
 
 
 def shrink(path: Path) -> None:
-    """Halve a picture, as somebody does who saves space."""
+    """Halve the size of an image file, like a user who saves space."""
     image = Image.open(path)
     image.resize((image.width // 2, image.height // 2), Image.Resampling.NEAREST).save(path)
 
 
 def blank(path: Path) -> None:
-    """A picture of the same size and mode with nothing on it."""
+    """Replace an image file by a black one of the same size and mode."""
     image = Image.open(path)
     Image.new(image.mode, image.size).save(path)

@@ -1,4 +1,4 @@
-"""Checkpoints of a tiny model that was never trained."""
+"""Checkpoints of a tiny untrained model."""
 
 import torch
 
@@ -9,7 +9,7 @@ TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loop
 
 
 def content(**changes):
-    """Of a checkpoint of a training; what is None is left out."""
+    """Content of a checkpoint of a training, without entries that are None."""
     state = {f"model.{key}": value for key, value in make_model().state_dict().items()}
     made = {"state_dict": state, "config": config(), "format_version": FORMAT_VERSION, **TRAINING, **changes}
     return {key: value for key, value in made.items() if value is not None}

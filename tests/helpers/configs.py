@@ -1,4 +1,4 @@
-"""Composed configurations, which several tests look at."""
+"""Composed configurations that several tests read."""
 
 import functools
 
@@ -9,12 +9,12 @@ from ghgs_lit.config import compose
 
 @functools.cache  # composing takes a fifth of a second
 def composed(verb: str, *overrides: str) -> DictConfig:
-    """``ghgs <verb> <overrides>`` as it is composed; nobody can change it."""
+    """The composed configuration of ``ghgs <verb> <overrides>``, read-only."""
     found = compose(verb, overrides)
     OmegaConf.set_readonly(found, True)
     return found
 
 
 def verb_with(group: str) -> str:
-    """A verb that has a config group."""
+    """A verb with this config group."""
     return "predict" if group == "calibration" else "train"

@@ -1,4 +1,4 @@
-"""A figure of ellipsoids before cameras, as photographs, masks and a calibration on disk."""
+"""A figure of ellipsoids in front of cameras, as photographs, masks and a calibration on disk."""
 
 import functools
 import json
@@ -46,8 +46,7 @@ def _photographed(views, height, width, seed, jitter, focal):
 
 
 class Figure:
-    """Photographs [v][h, w, 3] uint8, masks [v][h, w] bool and calibration of cameras around
-    the figure."""
+    """Photographs [v][h, w, 3] uint8, masks [v][h, w] bool and calibration of cameras around the figure."""
 
     def __init__(
         self, views=4, height=128, width=96, seed=0, jitter=0.0, focal=1.1, scale=1.0, origin=(0, 0, 0)
@@ -69,8 +68,7 @@ class Figure:
             }
 
     def write(self, folder: Path, masks: bool = True, cameras: Mapping[str, Any] | None = None) -> Path:
-        """Write ``cam0.png``, ``cam0_mask.png`` and so on, and ``cameras.json``,
-        whose path is returned."""
+        """Write ``cam0.png``, ``cam0_mask.png`` and so on, and ``cameras.json``, whose path is returned."""
         folder.mkdir(parents=True, exist_ok=True)
         for name, image, mask in zip(self.names, self.images, self.masks, strict=False):
             Image.fromarray(image).save(folder / f"{name}.png")
@@ -82,7 +80,7 @@ class Figure:
 
 
 def _turned(angles: np.ndarray) -> np.ndarray:
-    """A rotation about x by the first angle, y by the second, z by the third, radians."""
+    """Rotation about x by the first angle, then y by the second, then z by the third, in radians."""
     rotation = np.eye(3)
     for axis, angle in enumerate(angles):
         step, (i, j) = np.eye(3), [k for k in range(3) if k != axis]

@@ -1,4 +1,4 @@
-"""Replacements for gsplat that need no GPU: as a whole, and in parts."""
+"""Replacements for gsplat that need no GPU: its whole interface, and its parts."""
 
 import itertools
 
@@ -16,7 +16,7 @@ def functions():
 
 
 class Documented:
-    """A replacement for gsplat, as documented, whose ``rasterization`` draws by the reference."""
+    """A replacement with gsplat's documented interface, whose ``rasterization`` calls the reference."""
 
     __version__ = "1.4.0"
 
@@ -28,7 +28,7 @@ class Documented:
         assert (render_mode, packed) == ("RGB+ED", False)
         assert all(torch.isfinite(t).all() for t in (means, quats, scales, opacities))
         batch, count = means.shape[:2]
-        assert count == 32  # as many as a warp has threads
+        assert count == 32  # padded to the size of a warp
         assert quats.shape == (batch, count, 4)
         assert opacities.shape == (batch, count)
         assert viewmats.shape[:1] == Ks.shape[:1] == (batch,)
@@ -44,8 +44,7 @@ class Documented:
 
 
 class InParts(Documented):
-    """A replacement whose parts are gsplat's projection in PyTorch, and its kernel that draws,
-    in Python."""
+    """A replacement by parts: gsplat's projection in PyTorch, and its rasterization kernel in Python."""
 
     __version__ = "1.5.3"
 
@@ -74,8 +73,11 @@ class InParts(Documented):
 
 
 def drawn_by_tiles(centers, conics, colors, opacities, width, height, side, offsets, splats, masks):
-    """gsplat's kernel ``rasterize_to_pixels_3dgs_fwd``: one tile after another ends where the next
-    begins, the last of all at the end of the list. Tiles without a pixel stop at once."""
+    """gsplat's kernel ``rasterize_to_pixels_3dgs_fwd``.
+
+    The list of a tile ends where the next one begins, that of the last tile at the end of all. Tiles
+    without a pixel return immediately.
+    """
     ends = torch.cat((offsets.flatten()[1:], offsets.new_tensor([len(splats)]))).view_as(offsets)
     centers, conics, colors, opacities = (
         x.flatten(0, 2) for x in (centers, conics, colors, opacities[..., None])

@@ -1,5 +1,4 @@
-"""Sweeps without training, whose runs only record that they were executed,
-in this process or others."""
+"""Sweeps without training, whose runs only record their execution, in this process or others."""
 
 import os
 import time
@@ -26,14 +25,14 @@ register_resolvers()
 
 
 def write_finished_run(directory: Path, config: dict[str, Any], psnr: float = 20.0, **facts: Any) -> float:
-    """Write the results of a run, with facts of its provenance."""
+    """Write the results of a run, with further facts of its provenance."""
     row = {"method": "model", "subject": "p0", "views": 4, "targets": "release", "target": "0", "inputs": []}
     write_results(directory, [{**row, "psnr": psnr}], provenance(config, seed=config["seed"], **facts))
     return psnr
 
 
 def record_execution(run: Run, directory: Path, stats: dict[str, Any]) -> float:
-    """Replaces training: writes one line to the sweep's file ``executed``."""
+    """Instead of training, write one line to the sweep's file ``executed``."""
     with open(directory.parent / "executed", "a") as file:
         file.write(f"{directory.name} {os.getpid()} {run.resume}\n")
     stats |= {"steps": 10, "seconds": 5.0}
@@ -41,19 +40,18 @@ def record_execution(run: Run, directory: Path, stats: dict[str, Any]) -> float:
 
 
 def rehearse_nothing(monkeypatch) -> None:
-    """Let ``dry_run`` try nothing, for tests of plans alone."""
+    """Make ``dry_run`` rehearse nothing, for tests of the plan only."""
     monkeypatch.setattr("ghgs_lit.cli.rehearsal.rehearse", lambda configs: Rehearsal())
 
 
 def executed(sweep: Path) -> list[str]:
-    """Names of the runs in the order in which they were executed."""
+    """Names of the runs in the order of execution."""
     path = sweep / "executed"
     return [line.split()[0] for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def job(cfg) -> float | str | None:
-    """The job of a launcher: the verb without its training. With
-    ``data.workers`` it loads data, as training does."""
+    """The job of a launcher: the verb without training; ``data.workers`` loads data, as in training."""
     return train_once(RunDirectory(output_dir()), verb_class("train").of(plain(fill(cfg))), load_and_record)
 
 
@@ -67,7 +65,7 @@ def load_and_record(run: Run, directory: Path, stats: dict[str, Any]) -> float:
 
 
 def hydra_app(monkeypatch, *overrides: str) -> None:
-    """Run ``job`` as an application over ``conf/train.yaml``."""
+    """Run ``job`` as an application with ``conf/train.yaml``."""
     monkeypatch.setattr("sys.argv", ["ghgs", *overrides])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with reading_as_ghgs():
@@ -86,7 +84,7 @@ def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
 
 
 def work_through(sweep: Path, count: int, barrier) -> None:
-    """One of several processes that work on the same grid, one run after another."""
+    """One of several processes that work on the same grid, run by run."""
     job_module.in_sweep = lambda: True
     job_module._waits = lambda: False
     items = plan_seeds(sweep, count)

@@ -1,5 +1,4 @@
-"""Kernels of a CPU, and those of a GPU on tensors of the CPU, in Triton's interpreter, or on a GPU where
-there is one."""
+"""CPU kernels, and GPU kernels in Triton's interpreter on CPU tensors, or on a GPU if there is one."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -9,21 +8,21 @@ import pytest
 import torch
 from torch.library import _scoped_library
 
-import ghgs_lit.method.model  # noqa: F401  (it has all operators)
+import ghgs_lit.method.model  # noqa: F401  (imports all operators)
 from ghgs_lit.ops import dispatch
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-#: Kinds of kernels, and the device of the tensors that they compute with in tests.
+#: Kinds of kernels, with the device of their tensors in tests.
 WHERE = {"cpu": torch.device("cpu"), "cuda": DEVICE}
 
-#: Operators with kernels of a GPU.
+#: Operators with GPU kernels.
 NAMES = {name for name, operator in dispatch.OPERATORS.items() if "cuda" in operator.kernels}
 
 
 @contextmanager
 def kernels(kind: str = "cuda") -> Iterator[list[str]]:
-    """Inside, operators of the package are their kernels of ``kind`` for tensors on ``WHERE[kind]``; gives
-    the names of those that are called."""
+    """Within the context, run kernels of ``kind`` for tensors on ``WHERE[kind]``; yields the names of
+    called operators."""
     called = []
 
     def noted(name):
@@ -43,8 +42,8 @@ def kernels(kind: str = "cuda") -> Iterator[list[str]]:
 @contextmanager
 def _triton() -> Iterator[None]:
     pytest.importorskip("triton")
-    from ghgs_lit.ops import tiles  # here: it imports Triton
+    from ghgs_lit.ops import tiles  # imports Triton
 
-    rows = tiles.ROWS if DEVICE.type == "cuda" else 4096  # the interpreter is as fast for more
+    rows = tiles.ROWS if DEVICE.type == "cuda" else 4096  # the interpreter's time hardly grows with rows
     with mock.patch.object(dispatch, "DEVICES", {DEVICE.type}), mock.patch.object(tiles, "ROWS", rows):
         yield

@@ -1,12 +1,11 @@
-"""The recalibration as the paper writes it, one layer per call,
-without shared neighbours or cosines."""
+"""The recalibration as written in the paper, one layer per call, without shared neighbours or cosines."""
 
 import torch
 import torch.nn.functional as F
 
 
 def literal_recalibration(block, x, points, semantic, k):
-    """Recalibrated tokens of one batch element.
+    """Recalibrate the tokens of one batch element.
 
     Keys, values and features of the neighbours are gathered, [n, k, ...] each.
 

@@ -1,4 +1,4 @@
-"""Mistakes of a calibration: functions of a camera in the package's own JSON."""
+"""Mistakes of calibrations, as functions of a camera in the package's JSON format."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ PRINCIPAL = lens(lambda k, c: k / [[1, 1, c["width"]], [1, 1, c["height"]], [1, 
 SHIFTED = lens(lambda k, c: k + np.array([[0, 0, 0.1 * c["width"]], [0, 0, 0.05 * c["height"]], [0, 0, 0]]))
 INVERSE, OPENGL = pose(np.linalg.inv), pose(lambda e: FLIP @ e)
 
-# What all cameras have wrong, and the option that mends it.
+# Mistakes of all cameras, with the option that corrects them.
 ALL = {
     "inverse": (INVERSE, "calibration.extrinsics=camera_to_world"),
     "axes": (OPENGL, "calibration.axes=opengl"),
@@ -50,7 +50,7 @@ ALL = {
         "calibration.extrinsics=camera_to_world calibration.resized=2",
     ),
 }
-# What one camera of four has wrong, and words that explain it.
+# Mistakes of one camera of four, with words of the explanation.
 ONE = {
     "inverse": (INVERSE, "camera_to_world"),
     "axes": (OPENGL, "opengl"),

@@ -1,4 +1,4 @@
-"""Tiny models of any configuration, for the tests of the whole model."""
+"""Tiny models of any configuration, for tests of the whole model."""
 
 import copy
 import functools
@@ -17,13 +17,13 @@ TINY += ["recalibration.k=8", "recalibration.num_heads=2"]
 
 
 def config(*overrides):
-    """The nodes that describe a tiny model, as plain data."""
+    """The configuration nodes of a tiny model, as plain data."""
     return copy.deepcopy(_composed(overrides))
 
 
 @functools.cache  # composing costs more than the tiny models
 def _composed(overrides):
-    # Unless a test names its model: the one whose stages read most.
+    # By default, the model whose stages have the most inputs.
     chosen = [] if any(override.startswith("model=") for override in overrides) else ["model=hull"]
     composed = compose("train", [*TINY, *chosen, *overrides])
     nodes = [*STAGES, "skip", "model", "compat"]
@@ -32,7 +32,7 @@ def _composed(overrides):
 
 
 def make_model(*overrides, seed=0):
-    """A tiny model that has left its initial state, in which many outputs are constant."""
+    """A tiny model moved from its initial state, in which many outputs are constant."""
     torch.manual_seed(seed)
     model = GHGS.from_config(config(*overrides))
     for last in (
@@ -47,7 +47,7 @@ def make_model(*overrides, seed=0):
 
 
 def predict(model, batch):
-    """The prediction of a model for a batch in its own world."""
+    """The prediction of a model for a batch."""
     return Predictor(model)(batch)
 
 
@@ -57,8 +57,7 @@ def load_model(*arguments, **options):
 
 
 def close(a, b, limit=1e-5):
-    """Assert that two sets of Gaussians differ by ``limit`` of an attribute's largest
-    value at most."""
+    """Assert that Gaussians differ by at most ``limit`` times an attribute's largest absolute value."""
     for name in ATTRIBUTES:
         x, y = getattr(a, name), getattr(b, name)
         assert (x - y).abs().max() <= limit * y.abs().max(), name

@@ -17,7 +17,7 @@ from ghgs_people.jobs import RenderOptions, render_people
 from ghgs_people.rig import Rig
 from ghgs_people.scans import ScanSource
 
-if TYPE_CHECKING:  # processes that render need not import Lightning
+if TYPE_CHECKING:  # rendering processes do not import Lightning
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 V4 = {"training_counts": [4], "evaluation_count": 4}
@@ -29,7 +29,7 @@ TINY = RenderOptions(size=42, samples=2)
 def rendered(
     root: Path, views=V4, targets=RELEASE, seed=0, augmentation=None, **options
 ) -> PhotographsDataModule:
-    """Batches of what :func:`render_boxes` has written."""
+    """The data module of people that :func:`render_boxes` has rendered."""
     return Scans(root=root, **{"size": 28, "render": TINY, **options}).build(
         views, targets, seed, augmentation
     )
@@ -45,7 +45,7 @@ def box_person(name: str = "box", color=(200, 90, 30), extents=(0.5, 1.7, 0.3)) 
 
 
 def write_obj_scan(folder: Path, name: str, color=(200, 90, 30), textured: bool = True) -> Path:
-    """A scan as THuman2.0 has them; its body vertices are every vertex."""
+    """Write a scan in the format of THuman2.0, with all vertices as body vertices."""
     person = box_person(name, color, (0.4 + 0.01 * len(name), 1.5, 0.3))
     part = person.parts[0]
     (folder / name).mkdir(parents=True)
@@ -63,7 +63,7 @@ def write_obj_scan(folder: Path, name: str, color=(200, 90, 30), textured: bool 
 
 
 def render_boxes(root: Path, folder: Path, train: int = 3, val: int = 2, **changes) -> ScanSource:
-    """Rendered scans ``s0`` ... below ``root``; the scans lie in ``folder``."""
+    """Render scans ``s0`` ... below ``root``; the scans are in ``folder``."""
     names = [f"s{i}" for i in range(train + val)]
     for i, name in enumerate(names):
         if not (folder / name).exists():

@@ -1,4 +1,4 @@
-"""Plans for stages that are called by themselves."""
+"""Plans for stages that are called separately."""
 
 import torch
 
@@ -13,7 +13,7 @@ def plan_of(masks, patch_size=14, pixels="subject", tokens="subject"):
 
 
 def with_plan(stage):
-    """A recalibration stage that is given the plan of its points where it is called without one."""
+    """Make a recalibration stage compute the plan of its points when it is called without one."""
 
     def given(module, inputs):
         tokens, points, *plan = inputs

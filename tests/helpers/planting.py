@@ -1,4 +1,4 @@
-"""Defects planted in functions: one expression is replaced by another."""
+"""Plant defects in functions by replacing one expression with another."""
 
 import ast
 import re
@@ -7,14 +7,13 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-#: Names that stand for any expression in a change.
+#: Names that match any expression in a change.
 ANY = ("A", "B", "C", "D")
 CODE = "ghgs_*/**/*.py"
 
 
 def definitions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, ast.stmt]]:
-    """Names and nodes of functions, classes,
-    methods and constants of a module's or a class's body."""
+    """Names and nodes of functions, classes, methods and constants in the body of a module or class."""
     for node in body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield prefix + node.name, node
@@ -26,7 +25,7 @@ def definitions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, a
 
 @cache
 def _names(files: str) -> dict[str, tuple[str, str]]:
-    """File and name in the file of each dotted name; that of a module itself is empty."""
+    """File, and name inside it, of each dotted name; the latter is empty for a module."""
     names = {}
     for path in ROOT.glob(files):
         file = path.relative_to(ROOT)
@@ -38,10 +37,10 @@ def _names(files: str) -> dict[str, tuple[str, str]]:
 
 
 def found(files: str, end: str) -> tuple[str, str]:
-    """File and name in it of the one definition whose dotted name ends with ``end``.
+    """File, and name inside it, of the only definition whose dotted name ends with ``end``.
 
     Raises:
-        ValueError: none has it, or several.
+        ValueError: no definition matches, or several do.
     """
     fitting = [name for name in _names(files) if f".{name}".endswith(f".{end}")]
     if len(fitting) != 1:
@@ -50,7 +49,7 @@ def found(files: str, end: str) -> tuple[str, str]:
 
 
 def _fits(pattern: object, node: object, bound: dict[str, ast.expr]) -> bool:
-    """Whether code is that of a pattern; notes in ``bound`` what its ``ANY`` stand for."""
+    """Whether code matches a pattern; stores the expressions for ``ANY`` in ``bound``."""
     if isinstance(pattern, ast.Name) and pattern.id in ANY and isinstance(node, ast.expr):
         return (
             _fits(bound[pattern.id], node, {})
@@ -70,7 +69,7 @@ def _fits(pattern: object, node: object, bound: dict[str, ast.expr]) -> bool:
 
 
 class _Change(ast.NodeTransformer):
-    """Replaces code that fits the left side of ``before → after``, and counts it."""
+    """Replace code that matches the left side of ``before → after``, and count the replacements."""
 
     def __init__(self, change: str):
         before, self.after = change.split(" → ")
@@ -92,7 +91,7 @@ def change_code(code: ast.AST, change: str) -> None:
     """Change code in place, by ``before → after``.
 
     Raises:
-        ValueError: it does not have what is changed exactly once, or would stay the same.
+        ValueError: the left side does not match exactly once, or the code would stay equal.
     """
     transformer, before = _Change(change), ast.dump(code)
     transformer.visit(code)

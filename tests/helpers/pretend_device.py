@@ -1,15 +1,15 @@
-"""A pretend accelerator: its tensors say ``pretend:0``,
-hold CPU data and refuse to mix with CPU tensors.
+"""A pretend accelerator: tensors with device ``pretend:0`` and CPU data, which cannot mix with CPU tensors.
 
-What runs on it runs on a GPU as far as devices go, and what a GPU would wait for is counted. It is
-stricter than CUDA in one point: an index on the CPU is refused, since CUDA copies it at every call.
+Code that runs on it also runs on a GPU, as far as devices are concerned; device-to-host
+synchronisations of a GPU are counted. It is stricter than CUDA in one respect: an index on the CPU
+raises an error, because CUDA copies it at every call.
 
     with pretend_device() as log:
         model.to(DEVICE)(batch.to(DEVICE))
     print(log.waits)
 
-PyTorch's interface for backends in Python is experimental; all of its use is in this file. A
-process has one accelerator: where CUDA is, tests of this one are skipped.
+PyTorch's interface for backends in Python is experimental; it is only used in this file. A process
+has one accelerator: tests of this one are skipped if CUDA is available.
 """
 
 import sys
@@ -30,11 +30,11 @@ from ghgs_lit.ops import dispatch
 
 _PACKAGE = str(Path(ghgs_lit.__file__).parent)
 
-#: Operators that take tensors of both devices, as on CUDA.
+#: Operators that accept tensors of both devices, as on CUDA.
 _COPIES = ("aten::_to_copy", "aten::copy_", "aten::_copy_from")
-#: Operators that take no number (a tensor without dimensions) from the CPU; all others do.
+#: Operators that accept no number (a tensor without dimensions) on the CPU; all others do.
 _WITHOUT_NUMBERS = ("aten::cat", "aten::stack", "aten::index_copy", "aten::scatter", "aten::gather")
-#: Operators after which CUDA's host waits for the device, since it needs a value or a size.
+#: Operators after which CUDA's host waits for the device, because it needs a value or a size.
 _WAITING = (
     "aten::_local_scalar_dense",
     "aten::bincount",
@@ -45,7 +45,7 @@ _WAITING = (
     "aten::unique_dim",
     "aten::_unique2",
 )
-#: Operators that only describe memory: the device has nothing to do.
+#: Operators without work on the device: views and new memory.
 _WITHOUT_WORK = (
     *(
         "view",
@@ -66,14 +66,14 @@ _INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_unsaf
 
 
 class Log:
-    """What the pretend device was asked for: operator calls, and waits of the host.
+    """Operator calls on the pretend device, and waits of the host.
 
     Args:
-        by_line: note the line of the package that each belongs to (slow).
+        by_line: attribute calls to lines of the package (slow).
 
     Attributes:
         calls: number of calls by (operator, line).
-        waits: number of waits by (reason, line); copies that do not wait are not among them.
+        waits: number of waits by (reason, line), without copies that do not wait.
     """
 
     def __init__(self, by_line: bool = False):
@@ -81,7 +81,7 @@ class Log:
         self.clear()
 
     def clear(self) -> None:
-        """Begin again with nothing."""
+        """Reset all counts."""
         self.calls: Counter[tuple[str, str]] = Counter()
         self.waits: Counter[tuple[str, str]] = Counter()
 
@@ -93,7 +93,7 @@ class Log:
         )
 
     def add(self, name: str, reason: str | None) -> None:
-        """Note a call and, with a ``reason``, a wait."""
+        """Count a call and, with a ``reason``, a wait."""
         line = _line() if self.by_line else ""
         if not _inside_attention:
             self.calls[name, line] += 1
@@ -102,8 +102,7 @@ class Log:
 
 
 def _line() -> str:
-    """The innermost line of the package that is running,
-    ``backward`` where autograd runs by itself."""
+    """The innermost running line of the package; ``backward`` inside autograd."""
     frame = sys._getframe(1)
     while frame is not None:
         file = frame.f_code.co_filename
@@ -119,7 +118,7 @@ _inside_attention: list[bool] = []
 
 @contextmanager
 def _attention_is_one_call() -> Iterator[None]:
-    """CUDA has one kernel for it, which is found for all that this package asks."""
+    """Count attention as one call: CUDA has a fused kernel for all uses in this package."""
     attention = functional.scaled_dot_product_attention
 
     def counted(*args, **kwargs):
@@ -139,7 +138,7 @@ def _attention_is_one_call() -> Iterator[None]:
 
 
 class _Backend(_DummyBackendModule):
-    """What autocast and the autograd engine ask a backend."""
+    """The interface that autocast and the autograd engine expect of a backend."""
 
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
         return [torch.bfloat16, torch.float16]
@@ -148,7 +147,7 @@ class _Backend(_DummyBackendModule):
         return False
 
 
-# Called "pretend" where it is registered, below.
+# Registered as "pretend" below.
 CPU, DEVICE = torch.device("cpu"), torch.device("privateuseone", 0)
 
 
@@ -177,7 +176,7 @@ class PretendTensor(torch.Tensor):
         return self.inner.data_ptr()
 
     def __deepcopy__(self, memo):
-        """PyTorch's would copy the storage, which is empty."""
+        """Copy by clone: PyTorch's implementation copies the storage, which is empty."""
         copied = memo[id(self)] = self.detach().clone().requires_grad_(self.requires_grad)
         if hasattr(self, "_is_param"):
             copied._is_param = True
@@ -187,7 +186,7 @@ class PretendTensor(torch.Tensor):
         raise TypeError(f"can't convert a tensor on {DEVICE} to numpy ({_line()}): copy it with cpu() first")
 
     def __reduce_ex__(self, protocol):
-        """Files hold the values, as those of CUDA do for a machine without it."""
+        """Save the values, as CUDA tensors do for machines without CUDA."""
         return self.inner.__reduce_ex__(protocol)
 
     def __repr__(self, **_) -> str:
@@ -199,7 +198,7 @@ class PretendTensor(torch.Tensor):
 
 
 class _Mode(TorchDispatchMode):
-    """Sees factories, which have no tensor of the device among their arguments."""
+    """Intercepts factories, which have no tensor of the device among their arguments."""
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         return _call(function, args, kwargs or {})
@@ -207,8 +206,8 @@ class _Mode(TorchDispatchMode):
 
 @contextmanager
 def pretend_device(by_line: bool = False) -> Iterator[Log]:
-    """Inside, ``device="pretend"`` works for every function of PyTorch;
-    gives what is asked of it."""
+    """Within the context, ``device="pretend"`` works for every function of PyTorch; yields the log of
+    its calls."""
     if torch.cuda.is_available():
         raise SkipTest("the pretend device needs a process without CUDA (CUDA_VISIBLE_DEVICES=)")
     log = Log(by_line)
@@ -221,8 +220,7 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
 
 
 def _call(function, args, kwargs):
-    """Run an operator on the values of its arguments;
-    its result is on the device that CUDA would choose."""
+    """Run an operator on the values of its arguments; its result is on the device that CUDA would choose."""
     name = function.name().split(".")[0]
     tensors = list(_tensors((args, *kwargs.values())))
     is_here = any(isinstance(value, PretendTensor) for value in tensors)
@@ -240,7 +238,7 @@ def _call(function, args, kwargs):
             log.add(name, reason)
     bare = {key: _mapped(value, _inner) for key, value in kwargs.items()}
     if function.namespace == "ghgs_lit":
-        # Kernels on CUDA; here plain PyTorch, whose gradients come from autograd, which is off.
+        # Plain PyTorch instead of CUDA kernels; autograd, off here, must compute its gradients.
         function = dispatch.OPERATORS[name.removeprefix("ghgs_lit::")].plain
         with torch._C._SetExcludeDispatchKeyGuard(torch._C.DispatchKey.AutogradFunctionality, False):
             return _mapped(function(*_mapped(args, _inner), **bare), PretendTensor)
@@ -254,8 +252,7 @@ def _call(function, args, kwargs):
 
 
 def _tensors(values) -> Iterator[torch.Tensor]:
-    """Tensors among arguments of an operator,
-    which has no other containers than lists and tuples."""
+    """Tensors among arguments of an operator, whose only containers are lists and tuples."""
     for value in values:
         if isinstance(value, torch.Tensor):
             yield value
@@ -284,7 +281,7 @@ def _refuse_strangers(name: str, tensors: list[torch.Tensor]) -> None:
 
 
 def _reason_to_wait(name, args, kwargs, to_here: bool) -> str | None:
-    """Why CUDA's host waits for this call; None where it does not."""
+    """Reason for a device-to-host synchronisation of CUDA in this call; None: it does not wait."""
     if name in _WAITING:
         return name.removeprefix("aten::")
     if name in _INDEXING:
@@ -300,12 +297,12 @@ def _reason_to_wait(name, args, kwargs, to_here: bool) -> str | None:
     if not to_here:
         return "copy to the host"
     waits = not (kwargs.get("non_blocking") or (len(args) > 2 and args[2] is True))
-    # A number is an argument of the kernel that fills a tensor with it.
+    # A number is passed to the kernel as an argument.
     return "copy to the device" if waits and source.dim() > 0 else None
 
 
 def _written(function, args, kwargs) -> list[torch.Tensor]:
-    """The arguments that an operator returns after it has changed them."""
+    """Arguments that an operator changes in place and returns."""
     arguments = function._schema.arguments
     values = [*args, *(kwargs.get(argument.name) for argument in arguments[len(args) :])]
     written = [
@@ -334,10 +331,10 @@ def _copy_from(source, target, non_blocking=False):
     return _call(torch.ops.aten.copy_.default, (target, source), {"non_blocking": non_blocking})
 
 
-# On import: a device that comes after a process's first backward pass gets none.
+# On import: autograd starts no thread for a device registered after a process's first backward pass.
 if not torch.cuda.is_available():
     _setup_privateuseone_for_python_backend("pretend", _Backend())
-    # Indexing by lists and a few others come from C++ without passing through the mode.
+    # Indexing by lists and a few others call these from C++, not through the mode.
     _library = library.Library("aten", "IMPL")
     _library.impl("empty_strided", _empty_strided, "PrivateUse1")
     _library.impl("empty.memory_format", _empty, "PrivateUse1")

@@ -1,4 +1,4 @@
-"""Running code in a fresh interpreter, or in a fork of one that has imported all."""
+"""Run code in a fresh interpreter, or in a fork of one with all imports."""
 
 import multiprocessing
 import os
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-#: Makes processes by forking one that runs no threads and has imported what takes seconds.
+#: Forks processes from one without threads that has done all slow imports.
 PREPARED = multiprocessing.get_context("forkserver")
 PREPARED.set_forkserver_preload(
     [
@@ -22,9 +22,9 @@ PREPARED.set_forkserver_preload(
 
 
 def run_python(code: str, expected: int = 0, **variables: str) -> subprocess.CompletedProcess:
-    """``code``, which must end with exit code ``expected``, in a process with these variables."""
+    """Run ``code`` in a process with these environment variables; it must end with exit code ``expected``."""
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
-    # Where a user has not set it: tests of commands in this process have.
+    # Tests of commands set this variable in the parent process.
     before = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
     environment = {**before, "PYTHONPATH": path, **variables}
     done = subprocess.run(
@@ -35,31 +35,31 @@ def run_python(code: str, expected: int = 0, **variables: str) -> subprocess.Com
 
 
 def run_prepared(function: Callable, *arguments: object) -> None:
-    """Call a function of a module, which must succeed, in a process of :data:`PREPARED`."""
+    """Call a function of a module in a process of :data:`PREPARED`; it must succeed."""
     process = PREPARED.Process(target=function, args=arguments)
     process.start()
     process.join(300)
-    process.kill()  # where it hangs
+    process.kill()  # if it hangs
     assert process.exitcode == 0
 
 
 def run_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
-    """Exit code and output of ``ghgs ...`` in a folder, as a process of :data:`PREPARED`."""
+    """Run ``ghgs ...`` in a folder, as a process of :data:`PREPARED`; return exit code and output."""
     return _ended(*start_verb(command, folder, environment))
 
 
 def run_block(code: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
-    """The same of ``python -c <code>``."""
+    """Run ``python -c <code>`` like :func:`run_verb`."""
     return _ended(*_started(folder, environment, _block, code))
 
 
 def run_script(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
-    """The same of ``python <path> ...``."""
+    """Run ``python <path> ...`` like :func:`run_verb`."""
     return _ended(*_started(folder, environment, _script, shlex.split(command)[1:]))
 
 
 def start_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[BaseProcess, Path]:
-    """The process of :func:`run_verb`, and the file that its output goes to."""
+    """Start the process of :func:`run_verb`; return it and the file of its output."""
     return _started(folder, environment, _verb, shlex.split(command))
 
 
@@ -74,14 +74,14 @@ def _started(
 
 def _ended(process: BaseProcess, output: Path) -> tuple[int, str]:
     process.join(300)
-    process.kill()  # where it hangs
+    process.kill()  # if it hangs
     return process.exitcode, output.read_text()
 
 
 def _called_in(
     folder: Path, environment: dict[str, str], output: Path, function: Callable, given: object
 ) -> None:
-    # As in a fresh process, whose own processes import nothing more for these tests.
+    # As in a fresh process, whose children preload nothing.
     multiprocessing.set_start_method(None, force=True)
     PREPARED.set_forkserver_preload(["__main__"])
     os.environ.clear()

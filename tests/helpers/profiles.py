@@ -1,4 +1,4 @@
-"""ICC profiles of three primaries and a curve, and what they mean in sRGB, by the formulas."""
+"""ICC profiles with three primaries and a curve, and their conversion to sRGB by the formulas."""
 
 import struct
 
@@ -17,7 +17,7 @@ def srgb_decoded(values: np.ndarray) -> np.ndarray:
 
 
 def srgb_encoded(light: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`srgb_decoded`; other light is clipped."""
+    """The inverse of :func:`srgb_decoded`; light outside [0, 1] is clipped."""
     light = np.clip(light, 0, 1)
     return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
 
@@ -28,13 +28,13 @@ def curve_of(gamma: float | None, values: np.ndarray) -> np.ndarray:
 
 
 def in_srgb(pixels: np.ndarray, primaries: np.ndarray, gamma: float | None) -> np.ndarray:
-    """Pixels [..., 3] uint8 of a profile, as sRGB in [0, 255]."""
+    """Convert pixels [..., 3] uint8 of a profile to sRGB in [0, 255]."""
     light = curve_of(gamma, pixels / 255)
     return 255 * srgb_encoded(light @ (np.linalg.inv(SRGB) @ primaries).T)
 
 
 def profile(primaries: np.ndarray | None, gamma: float | None) -> bytes:
-    """An ICC profile of version 2. ``primaries``: as :data:`SRGB`; None: a profile of grey."""
+    """An ICC profile of version 2. ``primaries``: as :data:`SRGB`; None: a grey profile."""
     table = np.round(65535 * curve_of(gamma, np.linspace(0, 1, 1024))).astype(">u2").tobytes()
     curve = b"curv" + struct.pack(">II", 0, 1024) + table
     tags = {b"wtpt": _xyz((0.9642, 1.0, 0.8249))}

@@ -1,4 +1,4 @@
-"""A calibration of four cameras with lens distortion, as OpenCV describes it."""
+"""A calibration of four cameras with lens distortion, in OpenCV's conventions."""
 
 import cv2
 import numpy as np
@@ -8,8 +8,8 @@ POINTS = np.random.default_rng(1).uniform([-0.4, 0.0, -0.4], [0.4, 1.8, 0.4], (1
 
 
 def rig() -> dict[str, dict[str, np.ndarray]]:
-    """K, D, R and T of cameras by name; pixel centres at integers.
-    The fixtures hold the same cameras."""
+    """K, D, R and T of cameras by name, with pixel centres at integers; the fixtures have the same
+    cameras."""
     found = {}
     for i in range(4):
         angle = 1.4 * i
@@ -26,7 +26,7 @@ def rig() -> dict[str, dict[str, np.ndarray]]:
 
 
 def opencv_pixels(points, rotation, translation, intrinsics, distortion, fisheye=False) -> np.ndarray:
-    """Pixels [n, 2] of world points by OpenCV, pixel centres where ``intrinsics`` have them."""
+    """Pixels [n, 2] of world points by OpenCV, with the pixel centres of ``intrinsics``."""
     rvec = cv2.Rodrigues(rotation)[0]
     if fisheye:
         return cv2.fisheye.projectPoints(points[:, None], rvec, translation, intrinsics, distortion)[0][:, 0]

@@ -1,4 +1,4 @@
-"""An analytic subject in front of a ring of cameras, for the tests of the stages."""
+"""An analytic subject in front of a ring of cameras, for tests of the stages."""
 
 import json
 from dataclasses import replace
@@ -19,8 +19,7 @@ CENTER, RADII = torch.tensor([0.1, 0.9, 0.0]), torch.tensor([0.25, 0.8, 0.2])
 
 
 def fixture(name, part, dtype=torch.float32):
-    """The tensors of one part (``in``, ``out64``, ``state`` ...) of a fixture,
-    floats in ``dtype``."""
+    """The tensors of one part (``in``, ``out64``, ``state`` ...) of a fixture, floats in ``dtype``."""
     prefix = part + "/"
     tensors = load_file(FIXTURES / f"{name}.safetensors")
     found = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
@@ -52,7 +51,8 @@ def ellipsoid(cameras, center=CENTER, radii=RADII):
 
 
 def painted_ellipsoid(cameras):
-    """An ellipsoid whose colour is a smooth function of the place on its surface, and its depth."""
+    """An ellipsoid whose colour is a smooth function of the surface point; returns images, masks and
+    depths."""
     masks, depths = ellipsoid(cameras)
     points = unproject_maps(depths, cameras)
     colors = 0.5 + 0.4 * torch.sin(6 * points + torch.tensor([0.0, 1.0, 2.0]))
@@ -60,7 +60,7 @@ def painted_ellipsoid(cameras):
 
 
 def off(batch, pixels=2.0, seeds=(0,)):
-    """The batch with cameras that are off by up to ``pixels``."""
+    """The batch with camera errors of up to ``pixels``."""
     found = [
         perturb_cameras(batch.cameras[b], batch.masks[b], pixels, np.random.default_rng(seed))
         for b, seed in enumerate(seeds)
@@ -70,7 +70,7 @@ def off(batch, pixels=2.0, seeds=(0,)):
 
 
 def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
-    """An ellipsoid with noise as colours; ``kwargs`` go to :func:`ring`."""
+    """An ellipsoid with random colours; ``kwargs`` are passed to :func:`ring`."""
     cameras = ring(batch, views, height, width, **kwargs)
     masks, depths = ellipsoid(cameras)
     images = torch.rand(batch, views, 3, height, width, generator=torch.Generator().manual_seed(3))
@@ -78,21 +78,20 @@ def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
 
 
 def in_dtype(batch, dtype):
-    """The batch of photographs and cameras, and depths if known, in another precision."""
+    """The batch with images, cameras and depths, if any, in another precision."""
     depths = None if batch.depths is None else batch.depths.to(dtype)
     return replace(batch, images=batch.images.to(dtype), cameras=batch.cameras.to(dtype), depths=depths)
 
 
 def with_soft_rims(batch):
-    """The batch with a matte that falls from 1 to 0 over two pixels,
-    which premultiplies its photographs."""
+    """The batch with a matte that falls from 1 to 0 over two pixels, by which images are premultiplied."""
     alpha = torch.nn.functional.avg_pool2d(batch.masks.float(), 3, 1, 1)
     images = torch.rand(batch.images.shape, generator=torch.Generator().manual_seed(8))
     return replace(batch, images=images * alpha[:, :, None], masks=alpha >= 0.5, alpha=alpha)
 
 
 def training_batch(batch=1, size=28, views=3):
-    """As :func:`make_batch`, with a target for each element, the surface's points, and names."""
+    """:func:`make_batch` with a target for each element, points of the surface, and names."""
     inputs, seen = make_batch(batch, views, size, size), make_batch(batch, 2, size, size, spread=90.0)
     g = torch.Generator().manual_seed(4)
     directions = torch.nn.functional.normalize(torch.randn(batch, 40, 3, generator=g), dim=-1)
@@ -105,7 +104,7 @@ def training_batch(batch=1, size=28, views=3):
 
 
 def stack(batches):
-    """One batch of several, which have photographs, masks, cameras and depths of one size."""
+    """Concatenate batches of one size, with images, masks, cameras and depths."""
     tensors = {
         name: torch.cat([getattr(batch, name) for batch in batches]) for name in ("images", "masks", "depths")
     }
@@ -118,7 +117,7 @@ def stack(batches):
 
 
 def hard_subjects():
-    """Batches of one whose masks are extreme, by name; their windows differ in size."""
+    """Batches of one element with extreme masks, by name; their windows differ in size."""
     found = {"small": make_batch(zoom=0.5), "touching_the_border": make_batch(zoom=1.6)}
     for name in ("empty_in_one_view", "full_in_one_view", "single_pixel"):
         batch = make_batch(zoom=0.6)

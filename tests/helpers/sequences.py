@@ -26,7 +26,7 @@ def opened(place, images="images", masks="masks", **options):
 
 
 def instants(place, count=FRAMES):
-    """The same as a folder for each instant."""
+    """Write the sequence as a folder for each instant."""
     for number in range(count):
         folder = FIGURE.write(place / "instants" / f"{number:03d}").parent
         for camera, name in enumerate(FIGURE.names):
@@ -40,7 +40,7 @@ def numbers(photographs):
 
 
 def all_numbers(folder):
-    """What is predicted of a sequence: numbers by camera, by instant."""
+    """Numbers of a sequence, by instant and camera."""
     return {capture.name: numbers(capture.photographs) for capture in captures_of(folder)}
 
 

@@ -1,8 +1,7 @@
-"""Annotated shapes are checked (jaxtyping with beartype) in the first calls of each
-function in each test.
+"""Check annotated shapes (jaxtyping with beartype) in the first calls of each function in each test.
 
-The checks of a tiny model take longer than the model; what a function is called with in one test
-differs little from call to call.
+The checks of a tiny model take longer than the model, and the arguments of a function hardly differ
+between calls in one test.
 """
 
 import functools
@@ -12,23 +11,23 @@ from types import CodeType
 
 import jaxtyping
 
-#: Calls of each function that a test checks.
+#: Number of checked calls of each function in a test.
 CALLS = 5
 
 _jaxtyped = jaxtyping.jaxtyped
 _test = 0
-_calls: dict[CodeType, tuple[int, int]] = {}  # the last test that called it, and how often
+_calls: dict[CodeType, tuple[int, int]] = {}  # last test that called it, and number of calls
 
 
 def begin_test() -> int:
-    """Check the next calls of all functions. Returns: the number of the test in this process."""
+    """Check the next calls of all functions; return the number of the test in this process."""
     global _test
     _test += 1
     return _test
 
 
 def check_shapes(modules: Sequence[str]) -> None:
-    """Check calls of what these modules define, when they are imported from now on."""
+    """Check calls of functions and classes in these modules, if imported from now on."""
     jaxtyping.jaxtyped = _jaxtyped_at_first
     jaxtyping.install_import_hook(modules, "beartype.beartype")
 
@@ -39,7 +38,7 @@ def _jaxtyped_at_first(*, typechecker: Callable) -> Callable:
     def decorate(subject):
         if not inspect.isfunction(subject):
             return check(subject)
-        code = subject.__code__  # the same each time that a function within another is defined
+        code = subject.__code__  # equal for all closures of one definition
         checked = None
 
         @functools.wraps(subject)

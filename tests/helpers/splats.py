@@ -1,4 +1,4 @@
-"""Scenes and comparisons for the tests and benchmarks of the renderer."""
+"""Scenes and comparisons for tests and benchmarks of the renderer."""
 
 import dataclasses
 import math
@@ -18,13 +18,12 @@ def camera_ring(
 ) -> Cameras:
     """Cameras [batch, views] on a circle around the y axis that look at the origin.
 
-    Focal lengths of x and y differ and the principal point is off-centre,
-    so that mixed-up axes are seen.
+    Focal lengths of x and y differ and the principal point is off-centre, to detect swapped axes.
 
     Args:
         views, height, width, batch: number and image size of the cameras.
         distance: from the origin, in metres.
-        focal: focal length along x as a part of the image's width.
+        focal: focal length along x as a fraction of the image's width.
     """
     focal, principal = (focal * width, 1.1 * focal * width), (0.5 * width + 0.3, 0.5 * height - 0.2)
     start = 180 - math.degrees(0.2) if views > 1 else 180.0
@@ -35,7 +34,7 @@ def camera_ring(
 def cloud(
     count: int, seed: int = 0, size: float = 0.05, channels: int = 3, splits: tuple | None = None
 ) -> Gaussians:
-    """Random Gaussians around the origin, of all shapes and directions."""
+    """Random Gaussians around the origin, of all shapes and orientations."""
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=0.5 * torch.randn(count, 3, generator=generator),
@@ -48,8 +47,7 @@ def cloud(
 
 
 def body(count: int, size: int, seed: int = 0) -> Gaussians:
-    """Gaussians of about a pixel on an ellipsoid that covers a fifth of a ``size`` x
-    ``size`` image."""
+    """Gaussians of about a pixel on an ellipsoid that covers a fifth of a ``size`` x ``size`` image."""
     generator = torch.Generator().manual_seed(seed)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     pixel = 3.0 / (1.3 * size)
@@ -65,8 +63,7 @@ def body(count: int, size: int, seed: int = 0) -> Gaussians:
 
 
 def few(**fields) -> Gaussians:
-    """One round Gaussian at the origin; ``fields`` replaces values,
-    and more rows make more Gaussians."""
+    """One isotropic Gaussian at the origin; ``fields`` replace values, more rows make more Gaussians."""
     values = {
         "means": torch.zeros(1, 3),
         "quaternions": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -87,9 +84,9 @@ def with_gradients(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> 
 
 
 def ambiguous(gaussians: Gaussians, views: Cameras, settings: RasterSettings, **options) -> Tensor:
-    """Pixels [B, T, 1, h, w] where float32 and float64 may decide a threshold differently.
+    """Pixels [B, T, 1, h, w] where thresholds may decide differently in float32 and float64.
 
-    They change when the thresholds move by a little more than float32 rounds.
+    They change if the thresholds move by slightly more than the rounding error of float32.
     """
     images = []
     for sign in (-1, 1):
@@ -135,10 +132,9 @@ def assert_cpu_matches_reference(
     """Assert that the CPU backend in float32 equals the reference in float64, forward and backward.
 
     Args:
-        gaussians, views, settings, options: what to render.
+        gaussians, views, settings, options: arguments of the rendering.
         image_budget, gradient_budget: largest relative L2 errors.
-        ambiguous_budget: largest part of the pixels that may be left out because they
-            are ambiguous.
+        ambiguous_budget: largest share of pixels that are ambiguous and therefore excluded.
 
     Returns:
         The CPU backend's rendering.

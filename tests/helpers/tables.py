@@ -1,4 +1,4 @@
-"""Invented runs for the tests of tables."""
+"""Invented runs for tests of tables."""
 
 from pathlib import Path
 
@@ -32,16 +32,16 @@ def write_run(
     folder: Path, row, psnr, seed=1, views=(3, 4, 5), targets="release", shifts=SHIFTS, data="synthetic",
     protocol="correct", method="model", measured=None, metrics=None, provenance=None, **config,
 ) -> Path:  # fmt: skip
-    """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift.
+    """Write a run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift.
 
     Args:
         folder: Of the run.
         row: Its ablation.
         psnr: None: the run has no results yet.
-        measured: Further configuration of `ghgs evaluate`; None: of a training.
+        measured: Further configuration of `ghgs evaluate`; None: results of a training.
         metrics: Further metrics of each row of results.
         provenance: Further provenance.
-        config: Changes of the training's configuration; ``of_`` before ``views``, ``targets`` and ``data``.
+        config: Changes of the training's configuration; ``of_`` precedes ``views``, ``targets`` and ``data``.
     """
     config = config_of(row, seed, data, **{key.removeprefix("of_"): value for key, value in config.items()})
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def write_run(
 
 
 def tables_of(folder: Path, layout="ablation", by=(), others=(), **options):
-    """The tables of the runs below a folder."""
+    """Build the tables of the runs below a folder."""
     test = t.PairedTest(**options.pop("test", {}))
     chosen = t.TableOptions(t.LAYOUTS[layout], test=test, **options)
     return t.build_tables(t.read_sweep([folder], by), others, chosen)

@@ -1,4 +1,4 @@
-"""Tokens with points for the recalibration stage, and its neighbours by definition."""
+"""Tokens with points for the recalibration stage, and their neighbours by definition."""
 
 import numpy as np
 import torch

@@ -66,7 +66,7 @@ def example_batch(
 
 
 class Standin(nn.Module):
-    """One depth for all pixels and one shift of the colours."""
+    """A model with one depth for all pixels and one offset of the colours."""
 
     def __init__(self):
         super().__init__()
@@ -92,12 +92,12 @@ class Standin(nn.Module):
 
 
 def held(model: nn.Module, optimization: Optimization | None = None) -> BudgetedModule:
-    """A LightningModule that has nothing but the model."""
+    """A LightningModule with only the model."""
     return BudgetedModule(model, optimization or Optimization(lr=0.05), None)
 
 
 def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-    """Every image is the mean colour of its Gaussians, which is differentiable."""
+    """Render the mean colour of the Gaussians in every pixel, which is differentiable."""
     b, t = cameras.shape
     colors = torch.stack([gaussians[i].colors.mean(0) for i in range(b)])
     image = colors[:, None, :, None, None].expand(b, t, 3, cameras.height, cameras.width)
@@ -117,8 +117,7 @@ class _Steps(Dataset):
 
 
 class StepData(L.LightningDataModule):
-    """Training batches that are functions of the step, in epochs of ``length``;
-    two to validate on."""
+    """Training batches that are functions of the step, in epochs of ``length``; two for validation."""
 
     def __init__(self, length: int = 5):
         super().__init__()
@@ -146,7 +145,7 @@ def module(renderer=flat_renderer, lr=0.05, **weights) -> GHGSModule:
 
 
 def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
-    """On the CPU, without logs; ``options`` replace these."""
+    """A trainer on the CPU without logs; ``options`` replace its defaults."""
     defaults = {
         "logger": False,
         "enable_checkpointing": any(isinstance(c, Checkpoints) for c in callbacks),
@@ -167,12 +166,12 @@ def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
 
 
 def loader(count=3) -> DataLoader:
-    """Different batches, always the same."""
+    """The same ``count`` different batches in each epoch."""
     return DataLoader([example_batch(seed=s) for s in range(count)], batch_size=None, collate_fn=lambda b: b)
 
 
 def photographed(gaussians: Gaussians, cameras: Cameras) -> tuple[Batch, Prediction]:
-    """Renders of Gaussians as photographs, and a prediction of them with these Gaussians."""
+    """Renders of Gaussians as input views, and a prediction with these Gaussians."""
     rendering = render(gaussians, cameras)
     batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
     return batch, dataclasses.replace(Standin()(batch), gaussians=gaussians)

@@ -8,10 +8,10 @@ from ghgs_lit.cli.main import main
 
 
 def ghgs(*arguments: str) -> int:
-    """The exit code of ``ghgs <arguments>``."""
+    """Run ``ghgs <arguments>``; return its exit code."""
     before = sys.argv
     sys.argv = ["ghgs", *arguments]
-    # The script sets it for Hydra; where a user has set it, errors are raised.
+    # Set by the entry point; if a user has set it, errors are raised.
     os.environ.pop("HYDRA_FULL_ERROR", None)
     try:
         return main()
@@ -19,8 +19,7 @@ def ghgs(*arguments: str) -> int:
         return exit.code
     finally:
         sys.argv = before
-        # The log of the verb is opened at its first line, which another test would write,
-        # elsewhere.
+        # The log file of the verb is opened at its first line, which could come from another test.
         for handler in list(logging.getLogger().handlers):
             if isinstance(handler, logging.FileHandler):
                 logging.getLogger().removeHandler(handler)

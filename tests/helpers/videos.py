@@ -1,4 +1,4 @@
-"""Videos of a figure whose frames carry their number, on disk."""
+"""Video files of a figure, whose frames contain their number."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -9,12 +9,12 @@ from imageio_ffmpeg import write_frames
 
 from tests.helpers.figures import Figure
 
-#: The corner of frame n is as bright as n times this; the figure is elsewhere.
+#: The corner of frame n has n times this brightness; the figure does not cover it.
 STEP = 40
 
 
 def numbered_frames(figure: Figure, camera: int, count: int) -> Iterator[np.ndarray]:
-    """[h, w, 3] uint8 of each frame, 7 at most."""
+    """Frames [h, w, 3] uint8, at most 7."""
     for number in range(count):
         picture = figure.images[camera].copy()
         picture[:12, :12] = STEP * number

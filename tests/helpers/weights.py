@@ -20,13 +20,12 @@ with gzip.open(Path(__file__).parents[1] / "fixtures" / "published_keys.json.gz"
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.depth=4", "encoder.layers=[0,1,2,3]"]
 TINY += ["encoder.vit.depth=2", "encoder.vit.heads=2", "encoder.image_size=56"]
 
-#: Some tensors of VGGT-1B outside of the aggregator and the depth head.
+#: Some tensors of VGGT-1B outside the aggregator and the depth head.
 OTHER_HEADS = {"camera_head.pose.weight": (9, 4), "point_head.norm.bias": (8,), "track_head.x.bias": (2,)}
 
 
 def config(*overrides, tiny=True):
-    """The nodes of ``ghgs import`` that describe the model,
-    of a tiny one or of the published size."""
+    """The configuration nodes of the model in ``ghgs import``, tiny or of the published size."""
     return json.loads(_composed((*(TINY if tiny else ()), *overrides)))
 
 
@@ -38,7 +37,7 @@ def _composed(overrides):
 
 
 def import_weights(config, out, vggt, release=None, *args, **kwargs):
-    """Import as the verb does; returns the report."""
+    """Import weights as the verb does; return the report."""
     state = empty_state(config, release)
     return published.import_weights(state, config, out, vggt, release, *args, **kwargs)
 
@@ -61,7 +60,7 @@ def published_tensors(seed=0, **changes):
 
 
 def write_published(folder, suffix=".safetensors"):
-    """Write a tiny VGGT and a tiny release to ``folder``; returns their paths and their tensors."""
+    """Write a tiny VGGT and a tiny release to ``folder``; return their paths and tensors."""
     vggt, network = published_tensors()
     paths = folder / f"vggt{suffix}", folder / "release.pth"
     save_file(vggt, paths[0]) if suffix == ".safetensors" else torch.save(vggt, paths[0])

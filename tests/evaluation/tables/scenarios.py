@@ -9,7 +9,7 @@ PEOPLE = {f"s{i:02d}": 0.1 * i for i in range(12)}
 
 
 def people(number: int) -> dict[str, float]:
-    """Values of 12 subjects, some of which differ from run to run."""
+    """Values of 12 subjects, which vary slightly from run to run."""
     return {name: value + 0.01 * (i * (number + 3) % 7 - 3) for i, (name, value) in enumerate(PEOPLE.items())}
 
 
@@ -19,7 +19,7 @@ def seeds(row: str, *values: float, **about: Any) -> list[tuple]:
 
 
 def noisy(row: str, *values: float, start: int = 1, **about: Any) -> list[tuple]:
-    """The same, of many subjects."""
+    """A run for each seed from ``start`` on, with many subjects."""
     runs = []
     for seed, value in enumerate(values, start):
         runs.append((row, value, {"seed": seed, "views": (4,), "shifts": people(int(10 * value)), **about}))
@@ -48,7 +48,7 @@ def other(views: int = 4, psnr: float = 25.0, **changes: Any) -> dict[str, Any]:
 WEIGHTS = {"weights": "vggt.safetensors"}
 HULL = {"name": "hull"}
 FRAMES = {f"p{i // 5}_{i % 5:03d}": 0.3 * (i * 7 % 11) for i in range(20)}
-#: One run each: row (ablation), PSNR (None: no results yet), and what else it is.
+#: One run each: row (ablation), PSNR (None: no results yet), and further arguments of ``write_run``.
 RUNS: dict[str, list[tuple]] = {
     "mixed": [
         *seeds("full", 20.0, 21.0, None),
@@ -261,7 +261,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     ),
 }
 CONFIGURATION = "one configuration for ablation=full, .*"
-#: Names of runs and options that are refused, with the message.
+#: Names of runs and options that are rejected, with the message.
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
     (
         "rates",

@@ -13,8 +13,8 @@ SEED_EFFECT, SUBJECT_EFFECT = 0.1, 1.0  # dB
 
 
 def runs_of(rng, seeds, subjects, people, own=0.0, noise=0.05):
-    """A configuration: ``people`` [subjects], a chance of each seed, of it with each person,
-    and the rest."""
+    """Values of a configuration: ``people`` [subjects], random effects of seeds and of its people,
+    and noise."""
     by_person = people + own * rng.normal(size=subjects)
     by_seed = SEED_EFFECT * rng.normal(size=(seeds, 1))
     return pd.DataFrame(by_person + by_seed + noise * rng.normal(size=(seeds, subjects)))
@@ -23,7 +23,7 @@ def runs_of(rng, seeds, subjects, people, own=0.0, noise=0.05):
 @pytest.mark.parametrize("own", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("seeds", [2, 3, 6])
 def test_a_configuration_against_itself_is_marked_at_most_at_the_level(seeds, own):
-    """Under two names, whether seeds or people decide: within the error of so many trials."""
+    """Under two names, whether seeds or people dominate: within the error of this number of trials."""
     rng, trials, alpha = np.random.default_rng(1), 300, 0.05
     marked = 0
     for _ in range(trials):
@@ -34,7 +34,7 @@ def test_a_configuration_against_itself_is_marked_at_most_at_the_level(seeds, ow
 
 
 def test_the_interval_holds_the_difference():
-    """In 95 of 100 cases or more, and p is small where it does not hold 0."""
+    """It does so in at least 95 of 100 cases, and p is small where it does not contain 0."""
     rng, trials, inside = np.random.default_rng(4), 300, 0
     for _ in range(trials):
         row, reference = (runs_of(rng, 4, 16, np.zeros(16)) for _ in range(2))
@@ -57,7 +57,7 @@ def test_tables_of_equal_rows_have_a_star_at_most_at_the_level(ratios, seeds):
 
 
 def test_a_pooled_variance_finds_what_pairs_of_rows_do_not():
-    """The paper's differences with three seeds; what is said to be found is found."""
+    """With the paper's differences and three seeds; the smallest detectable difference is detected."""
     trials, alike = 100, [1] * 4
     pairs, pooled = (
         table_power.tables(table_power.PAPER, alike, 3, way, trials)[0] for way in ("pairs", "pooled")
@@ -71,7 +71,7 @@ def test_a_pooled_variance_finds_what_pairs_of_rows_do_not():
 
 
 def test_the_pooled_variance_is_that_of_a_regression_on_rows_and_seeds():
-    """Also where rows lack seeds, and a subject that a row lacks at one of them does not count."""
+    """Also where rows lack seeds; a subject that a row lacks at one of them does not count."""
     rows = [pd.DataFrame(RNG.normal(size=(4, 5)), index=[1, 2, 3, 4]) for _ in range(4)]
     rows[1], rows[2] = rows[1].drop(index=2), rows[2].drop(index=[1, 4])
     rows[3].loc[3, 0] = np.nan
@@ -85,15 +85,14 @@ def test_the_pooled_variance_is_that_of_a_regression_on_rows_and_seeds():
 
 
 def test_seeds_of_one_row_alone_say_nothing_about_their_variance():
-    """Rows of other seeds have no residuals."""
+    """Rows with disjoint seeds have no residuals."""
     rows = [pd.DataFrame(RNG.normal(size=(2, 3)), index=seeds) for seeds in ([1, 2], [3, 4])]
     assert pool(rows).freedom == 0
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 6])
 def test_the_reference_may_vary_twice_as_much(rows):
-    """Largest ratio of the variance of a difference to what the pooled one expects;
-    1 for two rows."""
+    """Largest ratio of the variance of a difference to that expected from the pooled one; 1 for two rows."""
     variances = np.array([RATIO**2] + [1] * (rows - 1))
     expected = variances[:2].sum() / (2 * variances.mean())
     pooled = Pool(0.3, 8, rows)
@@ -105,14 +104,14 @@ def test_the_reference_may_vary_twice_as_much(rows):
 
 
 def test_the_statistic_is_a_paired_t_test_where_seeds_decide():
-    """Of the means of seeds: SciPy's number where people agree."""
+    """Of the means of seeds: equal to SciPy's where people agree."""
     a, b = RNG.normal(size=5), RNG.normal(size=5)
     row, reference = (pd.DataFrame(np.repeat(values[:, None], 9, 1)) for values in (a, b))
     assert compare(row, reference).p == pytest.approx(stats.ttest_rel(a, b).pvalue, rel=1e-6)
 
 
 def test_pairs_are_the_seeds_and_subjects_that_both_have():
-    """Other seeds and other subjects are left out, and a subject that a seed lacks."""
+    """Other seeds, other subjects, and subjects that lack a seed are excluded."""
     row = pd.DataFrame([[1.0, 2, 9, 4], [2, 3, 9, np.nan]], index=[1, 2], columns=list("xyzv"))
     reference = pd.DataFrame([[0.5, 1, 0, 3]] * 3, index=[2, 1, 3], columns=list("xywv"))
     comparison = compare(row, reference)
@@ -131,7 +130,7 @@ def test_equal_rows_and_constant_differences_are_defined():
 
 
 def test_holm_is_the_textbooks():
-    """Holm's correction of known p-values, in their order."""
+    """Known p-values are corrected, in their order."""
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert holm([0.5, 0.9, 0.001]) == pytest.approx([1.0, 1.0, 0.003])
     assert holm([]) == []

@@ -1,5 +1,5 @@
-"""Tables of sweeps that are trained: the paper's four from one folder, against expected files, and one
-with an ablation of a user's own."""
+"""Tables of trained sweeps: the paper's four from one folder, against expected files, and one with a
+user-defined ablation."""
 
 import csv
 import json
@@ -25,10 +25,10 @@ SMALL = (
 
 
 def set_figures(path: Path) -> None:
-    """Give a run figures that depend on its data, views and ablation alone, on any machine."""
+    """Give a run figures that depend only on its data, views and ablation, on any machine."""
     content = json.loads(path.read_text())
     source = content["provenance"]
-    source["git"] = None  # of whoever commits while this runs
+    source["git"] = None  # may change while this runs
     (views,) = source["config"]["views"]["training_counts"]
     rank = list(ABLATIONS.values()).index(source["ablation"])
     shift = {"zju_mocap": 0.3, "humman": 0.6, "thuman2": 0.0}[source["data"]["name"]]
@@ -57,7 +57,7 @@ def runs(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("layout", SWEEPS)
 def test_each_layout_shows_its_runs_of_the_folder(runs, layout, tmp_path):
-    """One row of ours in tables 1 to 3, each column by the model trained with so many views."""
+    """Tables 1 to 3 have one row of ours; each column is of the model trained with that number of views."""
     assert len(list(runs.glob("*/metrics.json"))) == 2 + 3 + 3
     assert ghgs("table", f"runs={runs}", f"layout={layout}", f"hydra.run.dir={tmp_path}") == 0
     for name in (f"{layout}.md", f"{layout}.tex"):
@@ -65,7 +65,7 @@ def test_each_layout_shows_its_runs_of_the_folder(runs, layout, tmp_path):
 
 
 def test_an_ablation_of_ones_own_is_trained_evaluated_and_printed(tmp_path, boxes, monkeypatch, capsys):
-    """From a YAML file outside of the package to the row of its name."""
+    """From a YAML file outside the package to the row of its name."""
     monkeypatch.chdir(tmp_path)
     file = Path("conf/ablation/one_neighbor.yaml")
     file.parent.mkdir(parents=True)
@@ -82,7 +82,7 @@ def test_an_ablation_of_ones_own_is_trained_evaluated_and_printed(tmp_path, boxe
         assert provenance["ablation"] == provenance["config"]["chosen"]["ablation"]
         names[provenance["ablation"]] = path.parent
     assert set(names) == {"full", "one_neighbor"}
-    # Measured again: the checkpoint, not the command, tells which ablation it is.
+    # Measured again: the ablation is read from the checkpoint, not from the command.
     run = [f"checkpoint={names['one_neighbor']}/checkpoints/last.ckpt", "hydra.run.dir=measured"]
     assert ghgs("evaluate", *common, *run) == 0
     measured = json.loads(Path("measured/metrics.json").read_text())
@@ -99,6 +99,6 @@ def test_an_ablation_of_ones_own_is_trained_evaluated_and_printed(tmp_path, boxe
         assert float(rows["one_neighbor"]) == pytest.approx(sum(psnr) / len(psnr), rel=1e-6)
         assert (rows["neither"] == "", rows["full"] == "") == (True, False)
         assert "`one_neighbor`: `recalibration.k=1`." in Path("table/table.md").read_text()
-    # What the checkpoint was trained with cannot be set otherwise.
+    # The ablation of a checkpoint cannot be overridden.
     assert ghgs("evaluate", *common, *run, "ablation=full") == 1
     assert "ablation: expected one_neighbor, as the checkpoint was trained" in capsys.readouterr().err

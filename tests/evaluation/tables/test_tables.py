@@ -1,6 +1,6 @@
-"""Tables of invented runs against expected files, and runs, options and files that are refused.
+"""Tables of invented runs against expected files, and rejected runs, options and files.
 
-``written(case, suffix, folder)`` gives the text of a file of ``tests/fixtures/tables``.
+``written(case, suffix, folder)`` returns the text of a file of ``tests/fixtures/tables``.
 """
 
 import json
@@ -101,7 +101,7 @@ def test_latex_compiles(tmp_path):
 
 @pytest.mark.parametrize("planned", [["c", "a", "b"], None])
 def test_rows_stand_in_the_order_of_the_command_else_in_that_of_numbers(tmp_path, planned):
-    """Folders are called by hashes."""
+    """Names of folders, which are hashes, do not matter."""
     for name, rate in (("a", 10), ("b", 9), ("c", 0.25)):
         write_run(tmp_path / name, "full", 20.0, optimizer={"lr": rate})
     if planned:
@@ -124,7 +124,7 @@ def test_rows_stand_in_the_order_of_the_command_else_in_that_of_numbers(tmp_path
 @pytest.mark.parametrize("seeds", [(1, 2), (1, 1)])
 @pytest.mark.parametrize("is_training", [True, False])
 def test_other_views_and_targets_are_other_rows(tmp_path, key, values, title, seeds, is_training):
-    """They change the model, or what its protocol measures, as much as another learning rate."""
+    """They change the model, or its protocol, as much as another learning rate does."""
     group, _, name = key.partition(".")
     for number, value in enumerate(values):
         nodes = {"views": views(4), "targets": {"name": "release", "training_views": [2], "per_step": 3}}
@@ -151,7 +151,7 @@ def test_a_subject_counts_once_however_many_targets_it_has(tmp_path):
 
 
 def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
-    """The results of a run name it; its configuration before training does not."""
+    """Results of a run contain the weights' file; its configuration before training does not."""
     path = write_run(tmp_path / "0", "full", 20.0, encoder={"weights": "vggt.safetensors"})
     path = path.with_name("config.yaml")
     path.write_text(path.read_text().replace("vggt.safetensors", "null"))
@@ -161,7 +161,7 @@ def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
 
 @pytest.mark.parametrize("name", ["vggt_nano", "vggt_small", "vggt_1b"])
 def test_encoders_of_the_package_have_their_names(name):
-    """A file holds of the nested ``vit`` what differs from the file below it."""
+    """A file overrides single keys of the nested ``vit``."""
     assert encoder_name(run_of("train", [f"encoder={name}"]).plain) == name
 
 
@@ -256,7 +256,7 @@ PROVENANCE, ROW = "provenance", ("rows", 0)
     ],
 )
 def test_edited_results_are_one_line(tmp_path, value, keys, message):
-    """A results file that was changed by hand is named with the key that is wrong."""
+    """The error of a manually edited results file names the wrong key."""
     facts = {"training": {"steps": 1}, "git": {"commit": "a" * 40}}
     path = write_run(tmp_path / "0", "full", 20.0, provenance=facts)
     content = json.loads(path.read_text())
