@@ -1,8 +1,8 @@
-"""Convert photographs of a person to a splat.
+"""Photographs of a person to a splat.
 
-    python photographs_to_splat.py photographs cameras.json model.ckpt splat.ply
+python examples/photographs_to_splat.py photographs cameras.json model.ckpt splat.ply
 
-Masks are next to the photographs (``front_mask.png`` for ``front.jpg``), or are their alpha channels.
+Masks lie next to the photographs (``front_mask.png`` of ``front.jpg``), or are their alpha channels.
 """
 
 import sys

@@ -126,7 +126,13 @@ def test_paths_exist():
     assert not any(missing.values()), missing
 
 
-def test_rooms_exist():
+def test_example_of_a_head_is_the_file():
+    """The guide prints the whole of ``examples/linear_depth.py``, which its command trains."""
+    code = (REPOSITORY / "examples" / "linear_depth.py").read_text().partition("\n\n")[2]
+    assert f"```python\n{code}```" in (REPOSITORY / "docs" / "extend.md").read_text()
+
+
+def test_packages_exist():
     """The tables of CONTRIBUTING must name folders and files of today's package."""
     cells = re.findall(r"^\|(.+)\|$", (REPOSITORY / "CONTRIBUTING.md").read_text(), re.M)
     named = {n for cell in cells for n in re.findall(r"`([\w/]+\.(?:py|yaml)|[\w/]+/)`", cell)}
