@@ -1,19 +1,19 @@
-"""Layout on disk of rendered THuman2.0 data, of this and of other renderers.
+"""Layout on disk of rendered THuman2.0 data, by this package's or another renderer.
 
-``<root>/<phase>/`` with phase ``train`` or ``val`` holds, for each ring position and view number::
+``<root>/<phase>/`` with phase ``train`` or ``val`` contains, for each ring position and view number::
 
-    img/<id>_<position:03d>/<view>.jpg             photograph on black (.png is read too)
+    img/<id>_<position:03d>/<view>.jpg             image on black (.png is read, too)
     mask/<id>_<position:03d>/<view>.png            subject where channel 0 is above half of its maximum
     alpha/<id>_<position:03d>/<view>.png           optional; 8 bits, the share of each pixel that shows the
-                                                   subject, by which the photograph is premultiplied
-    depth/<id>_<position:03d>/<view>.png           optional; uint16, 2^15 / z, 0 where there is none
+                                                   subject, by which the image is premultiplied
+    depth/<id>_<position:03d>/<view>.png           optional; uint16, 2^15 / z, 0 where unknown
     parm/<id>_<position:03d>/<view>_intrinsic.npy  3 x 3 in pixels of the stored image
     parm/<id>_<position:03d>/<view>_extrinsic.npy  3 x 4 or 4 x 4, world to camera, metres, OpenCV axes
     smpl/<id>/vertices.npy                         optional (or smplx/): vertices of the body [n, 3]
 
-This package's renderer writes ``<root>/rendering/`` with ``plan.json`` (the requested subjects of
-each phase) and ``done/<phase>/<subject>`` (an empty file for each complete subject, written last).
-Data without ``rendering/`` was made elsewhere and counts as complete.
+This package's renderer also writes ``<root>/rendering/`` with ``plan.json`` (the requested subjects of
+each phase) and ``done/<phase>/<subject>`` (an empty file for each complete subject, written last). Data
+without ``rendering/`` comes from another renderer and counts as complete.
 """
 
 import itertools
@@ -40,13 +40,13 @@ from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import composed, find_path, read_json, require_folder
 
-#: Folder of the renderer's notes.
+#: Folder of the renderer's records.
 FOLDER = "rendering"
 
 
 @dataclass(frozen=True)
 class Completeness:
-    """The renderer's notes on which subjects of the data set at ``root`` are complete."""
+    """The renderer's records of which subjects of the data set at ``root`` are complete."""
 
     root: Path
 
@@ -71,42 +71,33 @@ class Completeness:
         return plan
 
     def marker(self, phase: str, name: str) -> Path:
-        """File that marks a subject as complete.
-
-        Args:
-            phase: ``train`` or ``val``.
-            name: of the subject.
-        """
+        """File that marks a subject as complete."""
         return self.folder / "done" / phase / name
 
     def missing(self, phase: str, names: Sequence[str]) -> list[str]:
-        """Those of several subjects that are not completely rendered;
-        none of data that was made elsewhere.
-
-        Args:
-            phase: ``train`` or ``val``.
-            names: of the subjects.
-        """
+        """Those subjects among ``names`` that are not completely rendered; none if another renderer made the
+        data."""
         return [name for name in names if not self.marker(phase, name).exists()] if self.rendered_here else []
 
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
-#: Folders of each position.
+#: Folders that contain a folder for each position.
 _KINDS = ("img", "mask", "alpha", "depth", "parm")
 _POSITION = re.compile(r"(.+)_(\d{3,})")
-#: Folders of bodies; the first that exists is read.
+#: Folders of bodies; the first one that exists is read.
 _BODY_MODELS = ("smpl", "smplx")
 
 
 class Rendered(DataOptions):
-    """Data in the rendered layout; subclasses define ``root``, ``limit`` and ``pixel_centers``."""
+    """Base options for data in the rendered layout; subclasses define ``root``, ``limit`` and
+    ``pixel_centers``."""
 
     @property
     def facts(self) -> dict[str, str]:
         return {**super().facts, "pixel_centers": self.pixel_centers}
 
     def subject_names(self, phase: str) -> list[str] | None:
-        """Names of the subjects of a phase; None: all that exist."""
+        """Names of the subjects to read in a phase; None: all that exist."""
         return None
 
     def has(self, phase: str) -> bool:
@@ -122,21 +113,21 @@ class Rendered(DataOptions):
 
 
 class Layout(Reader):
-    """Subjects of one phase of a rendered data set.
+    """Reader of one phase of a rendered data set.
 
     Args:
         root: folder of the data set.
         phase: ``train`` or ``val``.
-        names: subjects to read; those that the phase's folder lacks are read from the other one,
-            because the split may have changed; None: all.
-        limit: number of subjects, the first ones; None: all.
-        pixel_centers: of the renderer: ``half`` (+0.5, as this package), ``integer`` (as the
-            published scripts) or ``auto`` (integer unless rendered here).
-        strict: raise the first problem, or collect all.
+        names: subjects to read; those that are not in the phase's folder are read from the other one, as
+            the split may have changed; None: all.
+        limit: maximum number of subjects, the first ones; None: all.
+        pixel_centers: the renderer's convention: ``half`` (+0.5, as in this package), ``integer`` (as in
+            the published scripts) or ``auto`` (integer unless this package rendered the data).
+        strict: whether to raise the first problem or to collect all.
 
     Raises:
-        InputError: the root or phase is missing, empty, not completely rendered,
-            or lacks one of ``names``.
+        InputError: the root or phase is missing, empty, not completely rendered, or lacks one of
+            ``names``.
     """
 
     def __init__(
@@ -217,7 +208,7 @@ class Layout(Reader):
 
     @cached_property
     def _usual_positions(self) -> set[int]:
-        """Positions that half of the subjects have, or more."""
+        """Positions that at least half of the subjects have."""
         counts = Counter(itertools.chain.from_iterable(self.subjects.values()))
         return {position for position, count in counts.items() if 2 * count >= len(self.subjects)}
 
@@ -229,19 +220,12 @@ class Layout(Reader):
         return None if path is None else read_vertices(path)
 
     def _body(self, name: str) -> Path | None:
-        """The file of a subject's body, if there is one."""
+        """File of a subject's body; None: it has none."""
         paths = (find_path(self._folders[name], f"{model}/{name}/vertices.npy") for model in _BODY_MODELS)
         return next((path for path in paths if path is not None), None)
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """See :meth:`Reader.read_view`.
-
-        Args:
-            name: of the subject.
-            position: on the ring.
-            view: its number at the position, as in names of files.
-            depth: also read the depth map, if its file exists.
-        """
+        """Read an image with its mask, camera and optional maps, see :meth:`Reader.read_view`."""
         image = read_photograph(self._file(name, "img", position, str(view), _IMAGE_SUFFIXES))
         size = image.shape[:2]
         mask = read_map(self._file(name, "mask", position, f"{view}.png"), size)
@@ -268,12 +252,12 @@ class Layout(Reader):
         extrinsics = check_extrinsics(path, read_array(path, [(3, 4), (4, 4)]))
         intrinsics[:2, 2] += self._shift
         matrices = (matrix.astype(np.float32) for matrix in (intrinsics, extrinsics))
-        # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
+        # A threshold of half the maximum fits 0/1, 0/255 and compressed masks alike.
         return View(image, mask > mask.max() / 2, inverse, *matrices, matte)
 
     def _file(self, name: str, kind: str, position: int, file: str, suffixes: Sequence[str] = ("",)) -> Path:
-        """A file of a position in any spelling of its name, or else in the usual one; the first suffix is the
-        preferred one."""
+        """Path of a file of a position in any spelling that exists, otherwise in the usual one; the first
+        suffix is preferred."""
         folder = self._folder(name, kind, position)
         return find_path(folder, file, suffixes) or folder / f"{file}{suffixes[0]}"
 
@@ -283,12 +267,7 @@ class Layout(Reader):
 
 
 def position_name(name: str, position: int) -> str:
-    """Folder name of a subject's ring position.
-
-    Args:
-        name: of the subject.
-        position: on the ring, at least 0.
-    """
+    """Name of the folder of a subject's ring position."""
     return f"{name}_{position:03d}"
 
 

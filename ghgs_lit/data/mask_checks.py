@@ -1,4 +1,4 @@
-"""Checks of a person's masks: each by itself, against the body, and against the others."""
+"""Checks of a person's masks: each one alone, against the body, and against the other masks."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -10,25 +10,21 @@ from ghgs_lit.data.view import View, area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
 _T = TypeVar("_T")
-# Largest side of a coarse mask in cells.
+# Longer side of a coarse mask in cells.
 _CELLS = 64
-#: Comparison of masks, of which a quarter may be wrong.
+#: Comparison of masks; a quarter of them may be wrong.
 SEARCH = HullSearch(rays=200, depths=64, reach=1.0, others=12, wrong=0.25)
-# Least share of a photograph and greatest share of its border that a person covers.
+# Minimum share of an image, and maximum share of its border, that a person covers.
 _LEAST_SHARE = 1e-3
 _MOST_BORDER = 0.5
-# Fewer vertices do not fill a silhouette.
+# Minimum number of vertices that fill a silhouette.
 _LEAST_VERTICES = 500
-# Height of a body in cells; with more, cells between vertices of SMPL's torso would stay empty.
+# Maximum height of a body in cells; with more, cells between vertices of SMPL's torso stay empty.
 _BODY_CELLS = 96
 
 
 def make_silhouette(view: View) -> Silhouette:
-    """Coarse silhouette of a photograph, at most 64 cells high and wide.
-
-    Args:
-        view: the photograph; its mask and camera are read.
-    """
+    """Make a silhouette from the mask and camera of a view, at most 64 cells high and wide."""
     height, width = view.mask.shape
     scale = min(_CELLS / max(height, width), 1)
     size = max(round(height * scale), 1), max(round(width * scale), 1)
@@ -38,11 +34,7 @@ def make_silhouette(view: View) -> Silhouette:
 
 
 def implausible(mask: np.ndarray) -> str | None:
-    """Message if a mask is too small, full or inverted; else None.
-
-    Args:
-        mask: [h, w] bool, true on the subject.
-    """
+    """Message if a mask, [h, w] bool and true on the subject, is too small, full or inverted; else None."""
     border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1])).mean()
     if border > _MOST_BORDER:
         return (
@@ -56,21 +48,13 @@ def implausible(mask: np.ndarray) -> str | None:
 
 
 def measure_height(silhouettes: Sequence[Silhouette]) -> float:
-    """Median height of the subject in world units.
-
-    Args:
-        silhouettes: of one subject.
-    """
+    """Median height in world units of the subject of several silhouettes."""
     focus, _ = subject_sphere(silhouettes)
     return float(np.median([s.extent(focus)[0] for s in silhouettes]))
 
 
 def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
-    """Names of the first two equal poses; None if all differ.
-
-    Args:
-        poses: [4, 4] by name.
-    """
+    """Names of the first two equal poses among [4, 4] poses by name; None if all differ."""
     pairs = itertools.combinations(poses, 2)
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)
 
@@ -78,17 +62,17 @@ def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
 def measure_overlap(vertices: np.ndarray, view: View) -> float | None:
     """IoU of the silhouette of a body and a mask.
 
-    The silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts
-    outside the photograph do not count.
+    The silhouette is made on a grid so coarse that vertices can be joined without faces. Parts outside
+    the image are ignored.
 
     Args:
         vertices: [n, 3] in the world, metres.
-        view: the photograph; its mask and camera are read.
+        view: the view whose mask and camera are compared.
 
     Returns:
         IoU in [0, 1]; None with fewer than 500 vertices.
     """
-    from scipy import ndimage  # not where masks alone are checked
+    from scipy import ndimage  # not needed where only masks are checked
 
     if len(vertices) < _LEAST_VERTICES:
         return None

@@ -1,12 +1,11 @@
-"""Decoded photographs of each subject in one file,
-from which training reads at the speed of memory.
+"""Packed files with the decoded images of each subject, from which training reads at memory speed.
 
-A file holds the photographs of a subject that training may draw: of each the part that is not
-black, with the mask, the matte and the depth map of that part, and its camera. It is mapped into
-memory, so that processes share its pages. Its name has a digest of all that its values depend on
-(names, sizes and times of the files that were read, options, the version of this format): changed
-data is never read from an old file. Files are written at a subject's first use, atomically: what is
-interrupted is written again, and where two processes write the same file, either is right.
+A file contains the images of one subject that training may sample: the part of each image that is not
+black, with its mask, matte and depth map, and the camera. It is memory-mapped, so that processes share
+its pages. Its name contains a digest of everything that its values depend on (names, sizes and times of
+the source files, options, the version of this format), so that changed data is never read from an old
+file. Files are written atomically at a subject's first use: after an interruption they are written
+again, and if two processes write the same file, either result is valid.
 """
 
 import contextlib
@@ -34,31 +33,30 @@ from ghgs_lit.files import write_atomically
 
 log = logging.getLogger(__name__)
 
-#: Changes with the format of the files and with every change of how photographs are
-#: decoded or resized.
+#: Version of the format; incremented with each change of how images are stored, decoded or resized.
 _VERSION = 2
-#: Files that a process keeps open.
+#: Number of files that a process keeps open.
 _OPEN_FILES = 128
-#: Largest share of the free disk that packed photographs may take.
+#: Maximum share of the free disk space that packed files may take.
 _SHARE_OF_DISK = 0.5
-#: Arrays of a photograph of which the part that is not black is kept, and its whole ones.
+#: Arrays of a view of which only the part that is not black is stored, and arrays stored whole.
 _MAPS = ("image", "mask", "matte", "inverse_depth")
 _CAMERA = ("intrinsics", "extrinsics")
 
 
 @dataclass
 class Packs:
-    """Packed files of the subjects of a reader, at one size of photographs.
+    """Packed files of a reader's subjects, at one image size.
 
     Args:
-        reader: of the photographs in their own files; a subject's file depends on its ``sources``.
-        folder: where packed files are.
-        size: (height, width) of the packed photographs in pixels; None: as stored.
-        resampling: how they are resized, as for :func:`ghgs_lit.data.view.resize_view`.
-        views: numbers of the views at each position that are packed.
+        reader: reader of the original files; a subject's packed file depends on its ``sources``.
+        folder: folder of the packed files.
+        size: (height, width) of the packed images in pixels; None: as stored.
+        resampling: method of resizing, see :func:`ghgs_lit.data.view.resize_view`.
+        views: numbers of the views that are packed at each position.
         depths: whether depth maps are packed.
-        writes: whether missing files are written; otherwise only those that exist are read.
-        paths: file of each subject that was read; None: it cannot be packed.
+        writes: whether missing files are written; otherwise only existing files are read.
+        paths: packed file of each subject read so far; None: it cannot be packed.
     """
 
     reader: Reader
@@ -72,27 +70,22 @@ class Packs:
 
     @property
     def digest(self) -> str:
-        """Name of the settings in names of files."""
+        """Digest of the settings, part of file names."""
         resized = None if self.size is None else (self.size, self.resampling)
         return _digest([_VERSION, PIL.__version__, resized, self.views, self.depths])
 
     def view(self, name: str, position: int, view: int, depth: bool) -> View | None:
-        """A photograph as :meth:`Reader.checked_view` returns it, at the size of the packed ones.
-
-        Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-            view: its number at the position.
-            depth: with its depth map, if there is any.
+        """Read a packed view, at the size of the packed files; arguments as for
+        :meth:`Reader.checked_view`.
 
         Returns:
-            The photograph; None: it is not packed, or without its depth map.
+            The view; None: it is not packed, or is packed without the requested depth map.
         """
         pack = self.pack(name)
         return None if pack is None or depth > self.depths else pack.view(position, view, depth)
 
     def pack(self, name: str) -> "Pack | None":
-        """The packed file of a subject, written if it is missing; None: there is none."""
+        """Open the packed file of a subject, and write it if it is missing; None: there is none."""
         if name not in self.paths:
             self.paths[name] = self._path(name)
         path = self.paths[name]
@@ -102,15 +95,16 @@ class Packs:
         if pack is None and self.writes:
             self._write(name, path)
             pack = _try_open(path)
-        if pack is None:  # nothing is written or looked for again
+        if pack is None:  # do not try again
             self.paths[name] = None
         return pack
 
     def _path(self, name: str) -> Path | None:
-        """The file of a subject, named after the names, sizes and times of its sources."""
+        """Path of a subject's file, named after the names, sizes and times of its sources; None: unknown
+        sources."""
         facts = []
         for source in sorted(map(str, self.reader.sources(name))):
-            with contextlib.suppress(OSError):  # an option, or a file that may be missing
+            with contextlib.suppress(OSError):  # a text that describes an option, or a missing file
                 status = os.stat(source)
                 facts.append((status.st_size, status.st_mtime_ns, status.st_ctime_ns))
             facts.append(source)
@@ -119,10 +113,10 @@ class Packs:
         return self.folder / f"{name}-{self.digest}-{_digest(facts)}.safetensors"
 
     def _write(self, name: str, path: Path) -> None:
-        """Write the file of a subject and remove older ones of the same settings."""
+        """Write the file of a subject, and remove outdated files with the same settings."""
         content = {}
         for position, view in itertools.product(self.reader.subjects[name], self.views):
-            with contextlib.suppress(InputError):  # raised when it is sampled
+            with contextlib.suppress(InputError):  # raised later, when the view is sampled
                 stored = self.reader.checked_view(name, position, view, self.depths)
                 content |= _pack_view(position, view, resize_view(stored, self.size, self.resampling))
         try:
@@ -135,11 +129,11 @@ class Packs:
             log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
 
     def fit(self, most_gb: float, announce: Callable[[str], None]) -> bool:
-        """Whether the files of all subjects may take the room that they need on the disk.
+        """Whether the files of all subjects fit within the limit and the free disk space.
 
         Args:
-            most_gb: largest size of all files in GB (10^9 bytes).
-            announce: takes a line on their size and place, or why nothing is packed.
+            most_gb: maximum size of all files in GB (10^9 bytes).
+            announce: called with a line about their size and folder, or the reason for packing nothing.
         """
         names = list(self.reader.subjects)
         pack = self.pack(names[0])
@@ -158,7 +152,7 @@ class Packs:
 
 
 class Pack:
-    """The packed photographs of one subject, in the file ``path``, which has a size of ``bytes``."""
+    """Reader of the packed images of one subject, in the file ``path`` of ``bytes`` bytes."""
 
     def __init__(self, path: Path) -> None:
         self.bytes = path.stat().st_size
@@ -166,7 +160,7 @@ class Pack:
         self._names = frozenset(self._file.keys())
 
     def view(self, position: int, view: int, depth: bool) -> View | None:
-        """One photograph as :meth:`Packs.view`; None: it is not in the file."""
+        """Read one view, see :meth:`Packs.view`; None: it is not in the file."""
         place = f"{position}/{view}/"
         if place + "box" not in self._names:
             return None
@@ -182,7 +176,7 @@ class Pack:
 
 
 def _pack_view(position: int, number: int, view: View) -> dict[str, np.ndarray]:
-    """Arrays of a photograph by their names in the file."""
+    """Arrays of a view by their names in the file."""
     maps = {name: array for name in _MAPS if (array := getattr(view, name)) is not None}
     shown = view.image.any(-1)
     for array in maps.values():
@@ -198,7 +192,7 @@ def _pack_view(position: int, number: int, view: View) -> dict[str, np.ndarray]:
 
 
 def _try_open(path: Path) -> Pack | None:
-    """The file at ``path`` if there is a whole one."""
+    """Open the file at ``path``; None if it is missing or incomplete."""
     try:
         return _open(path)
     except (OSError, SafetensorError):
@@ -213,14 +207,8 @@ def _digest(facts: list) -> str:
 
 
 def choose_folder(data: Path) -> Path:
-    """Folder of the packed photographs of a data set.
-
-    Args:
-        data: folder of the data set.
-
-    Returns:
-        A folder in it, or in the user's cache where it cannot be written to.
-    """
+    """Folder for the packed files of the data set in ``data``: below it if it is writable, otherwise in
+    the user's cache."""
     in_data = data / "packed"
     if os.access(in_data if in_data.is_dir() else data, os.W_OK | os.X_OK):
         return in_data

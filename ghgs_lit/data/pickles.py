@@ -1,9 +1,9 @@
 """Safe reading of pickles of data sets.
 
-The writer of a pickle chooses what is called while it is read. Only arrays and plain containers are
-admitted; every other name is refused before anything is called. Names of NumPy 1 (``numpy.core``)
-and 2 (``numpy._core``) and of Python 2 (``__builtin__``) are known; trimesh's array subclass is
-read as an array.
+The writer of a pickle decides what is called when it is loaded. This module admits arrays and plain
+containers only, and rejects every other name before anything is called. It supports the names of NumPy 1
+(``numpy.core``), NumPy 2 (``numpy._core``) and Python 2 (``__builtin__``); trimesh's subclass of arrays
+is read as an array.
 """
 
 import codecs
@@ -22,7 +22,7 @@ from ghgs_lit.parsing import read_npy
 
 
 def _bytes(text: str, encoding: str = "latin1") -> bytes:
-    """Bytes as protocols below 3 write them; no other codec is admitted."""
+    """Decode bytes as written by protocols below 3; other codecs are rejected."""
     if encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError(f"codec {encoding!r}")
     return codecs.encode(text, "latin1")
@@ -68,7 +68,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """Read a pickle with the admitted names and with ``also``, replacements of further ones."""
+    """Load a pickle with the admitted names, and with replacements ``also`` for further ones."""
     try:
         return _Unpickler(stream, also).load()
     except _Refused as error:
@@ -83,11 +83,11 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
     """Read the arrays, scalars and plain containers of a pickle.
 
     Args:
-        path: of the file.
+        path: the file.
         also: harmless replacements for further names (module, name).
 
     Raises:
-        InputError: it is missing, broken, or names anything else, which is not called.
+        InputError: the file is missing or broken, or contains any other name, which is not called.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a pickle; found no such file")
@@ -96,16 +96,14 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
 
 
 def load_npy(path: Path) -> Any:
-    """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`.
-
-    Args:
-        path: of the file.
+    """Read an ``.npy`` file, with its pickled objects as in :func:`load_pickle`.
 
     Returns:
-        An array; of one without dimensions (``np.save`` of a dictionary) the object in it.
+        An array; for an array of objects without dimensions (``np.save`` of a dictionary), its object.
 
     Raises:
-        InputError: it is missing, broken, or names anything but arrays and plain containers.
+        InputError: the file is missing or broken, or contains anything except arrays and plain
+            containers.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected an .npy file; found no such file")
@@ -119,5 +117,5 @@ def load_npy(path: Path) -> Any:
         return read_npy(path)
     except InputError:
         raise
-    except Exception as error:  # headers are Python, whose tokenizer raises errors of its own
+    except Exception as error:  # headers are Python source, and its tokenizer raises many types
         raise InputError(f"{path}: expected a readable .npy file; found {error}") from error

@@ -1,7 +1,7 @@
-"""Readers of photographs by subject, position and view.
+"""Readers of images by subject, position and view.
 
-A data set provides a :class:`Reader`, which finds and decodes its files. Resizing, caching and
-batching (:class:`Photographs`) and sampling are the same for all data sets.
+A data set implements a :class:`Reader`, which finds and decodes its files. Resizing, caching and
+batching (:class:`Photographs`), as well as sampling, are the same for all data sets.
 """
 
 import contextlib
@@ -28,17 +28,17 @@ Size = tuple[int, int]
 
 
 class Reader(ABC):
-    """Stored photographs of one phase (``train`` or ``val``).
+    """Base class of readers of the stored images of one split, such as ``train`` or ``val``.
 
-    A photograph is identified by (position, view); ``view`` is 0 except on rings that were rendered
-    with further views between cameras.
+    An image is identified by (position, view). ``position`` is the index of a camera, or of a position on
+    the ring; ``view`` is 0 except on rings that were rendered with further views between cameras.
 
     Args:
-        strict: raise the first problem of the data set, or collect all in ``problems``.
+        strict: whether to raise the first problem of the data set or to collect all in ``problems``.
 
     Attributes:
-        subjects: positions of the cameras of each subject (a person, or one frame of a person).
-        problems: what is wrong with the data set, a line each.
+        subjects: camera positions of each subject (a person, or one frame of a person).
+        problems: one line for each problem of the data set.
     """
 
     def __init__(self, strict: bool = True) -> None:
@@ -48,13 +48,13 @@ class Reader(ABC):
 
     @abstractmethod
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """Read one photograph at its stored size.
+        """Read one image with its mask and camera at its stored size.
 
         Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-            view: its number at the position; 0 except on rings with further views between cameras.
-            depth: also read the depth map, if there is any.
+            name: name of the subject.
+            position: index of the camera, or position on the ring.
+            view: number of the view at the position; 0 except on rings with further views.
+            depth: also read the depth map, if there is one.
 
         Raises:
             InputError: a file is missing or bad.
@@ -62,59 +62,41 @@ class Reader(ABC):
 
     @abstractmethod
     def read_body(self, name: str) -> np.ndarray | None:
-        """Body vertices [n, 3] float32 in the world, metres; None if the data has none."""
+        """Read the body's vertices [n, 3] float32 in the world, metres; None if the data has none."""
 
     @property
     def people(self) -> int:
-        """Number of people; fewer than subjects where a subject is one frame of a person."""
+        """Number of people, less than that of subjects if a subject is one frame of a person."""
         return len(self.subjects)
 
     def views_at(self, name: str, position: int) -> list[int]:
-        """Numbers of the views that have a photograph at a position.
-
-        Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-        """
+        """Numbers of the views of a subject that exist at a position."""
         return [0]
 
     def place(self, name: str, position: int, view: int) -> str:
-        """Name of a photograph in messages, preferably the path of its mask.
-
-        Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-            view: its number at the position.
-        """
+        """Name of an image in messages, preferably the path of its mask."""
         return f"{name}, camera {position}, view {view}"
 
     def sources(self, name: str) -> Iterable[Path | str]:
-        """All that a subject's photographs and body depend on: paths of files, and texts that
-        name options of their decoding. Empty: not known, and the subject is never packed
+        """Everything on which a subject's images and body depend: paths of files, and texts that describe
+        options of their decoding. Empty: unknown, so that the subject is never packed
         (:mod:`ghgs_lit.data.packed`)."""
         return ()
 
     def files(self, name: str) -> Iterable[Path]:
-        """Files that a subject's photographs are read from, whether they are there or not."""
+        """Files from which a subject's images are read; they need not exist."""
         return [source for source in self.sources(name) if isinstance(source, Path)]
 
     def body_place(self, name: str) -> Path | str:
-        """File of a subject's body, whether it is there or not;
-        a text where an option has to name it."""
+        """File of a subject's body, which need not exist; a text if an option has to specify it."""
         return f"the body of {name}"
 
     def checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """One photograph as :meth:`read_view`.
-
-        Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-            view: its number at the position.
-            depth: also read the depth map, if there is any.
+        """Read one image with :meth:`read_view`, and check it.
 
         Raises:
-            InputError: a file is missing or bad, the reader gives a wrong view,
-                or the mask is empty.
+            InputError: a file is missing or bad, the reader returns an invalid view, or the mask is
+                empty.
         """
         stored = self.read_view(name, position, view, depth)
         place = self.place(name, position, view)
@@ -125,7 +107,7 @@ class Reader(ABC):
 
     @contextlib.contextmanager
     def collecting(self) -> Iterator[None]:
-        """Raise or collect an InputError of the block as a problem of the data set."""
+        """Context that collects an InputError in ``problems``, or raises it if the reader is strict."""
         try:
             yield
         except InputError as error:
@@ -137,7 +119,7 @@ class Reader(ABC):
         """Raise or collect a problem of the data set.
 
         Args:
-            line: ``<place>: expected ...; found ...``.
+            line: the message, ``<place>: expected ...; found ...``.
 
         Raises:
             InputError: the reader is strict.
@@ -147,18 +129,19 @@ class Reader(ABC):
 
 
 class Photographs:
-    """Photographs of a reader: resized, kept in memory, and collated into batches.
+    """Images of a reader: resizes them, caches them in memory, and collates them into batches.
 
     Args:
-        reader: finds and decodes them.
+        reader: reader of the data set.
         size: (height, width) of the inputs in pixels; None: as stored.
-        cache_mb: MiB of decoded views and bodies kept in each process, at least 0; the least
-            recently used go first.
-        resampling: as for :func:`ghgs_lit.data.view.resize_view`.
-        target_size: (height, width) of the targets in pixels; None: as the inputs.
+        cache_mb: MiB of decoded views and bodies cached in each process, at least 0; the least recently
+            used are dropped first.
+        resampling: see :func:`ghgs_lit.data.view.resize_view`.
+        target_size: (height, width) of the targets in pixels; None: same as the inputs.
 
     Attributes:
-        packs: packed files by the size of their photographs, which are read first.
+        packs: packed files by the size of their images; they take precedence over the reader.
+        cached_bytes: size of the cached views and bodies.
     """
 
     def __init__(
@@ -182,18 +165,17 @@ class Photographs:
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: Size | None = None
     ) -> View:
-        """One photograph, resized with its intrinsics.
+        """Read one image, resized together with its maps and intrinsics.
 
         Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-            view: its number at the position.
-            depth: also read the depth map, if there is any.
+            name: name of the subject.
+            position: index of the camera, or position on the ring.
+            view: number of the view at the position.
+            depth: also read the depth map, if there is one.
             size: (height, width) in pixels; None: ``self.size``.
 
         Raises:
-            InputError: a file is missing or bad, the reader gives a wrong view,
-                or the mask is empty.
+            InputError: see :meth:`Reader.checked_view`.
         """
         size = size or self.size
         packs = self.packs.get(size) or self.packs.get(None)
@@ -208,10 +190,10 @@ class Photographs:
         return self._cached((name, position, view, depth, size), read)
 
     def body(self, name: str) -> np.ndarray | None:
-        """Body vertices as :meth:`Reader.read_body`.
+        """Read and check a subject's body, see :meth:`Reader.read_body`.
 
         Raises:
-            InputError: they are bad.
+            InputError: it is not an array [n, 3] of finite numbers.
         """
 
         def read() -> np.ndarray | None:
@@ -242,14 +224,13 @@ class Photographs:
         depths: bool = True,
         target_depths: bool = True,
     ) -> Batch:
-        """Batch of samples with equal numbers of inputs and equal target protocols (or none).
+        """Read samples with equal numbers of inputs and equal target protocols (or none) as a batch.
 
         Args:
             samples: the samples, at least one.
-            sizes: (height, width) of the inputs and of the targets in pixels; None: those of the
-                photographs.
-            depths: whether depth maps of the inputs are read, if there are any.
-            target_depths: whether those of the targets are, too; only measurements need them.
+            sizes: (height, width) of the inputs and of the targets in pixels; None: the configured ones.
+            depths: whether depth maps of the inputs are read, if they exist.
+            target_depths: whether depth maps of the targets are read; only measurements need them.
 
         Raises:
             InputError: a file is missing or bad.
@@ -279,8 +260,8 @@ class Photographs:
         size: Size | None,
         with_alpha: bool = False,
     ) -> tuple[dict[str, Any], tuple[tuple[str, ...], ...]]:
-        """Maps [B, V, ...] and cameras of the photographs of B subjects, and the photographs' names;
-        None for a map that a photograph lacks."""
+        """Stack the maps [B, V, ...] and cameras of B subjects, with the names of their images; a map that
+        any image lacks is None."""
         views = []
         for name, several in photos:
             views += [self.view(name, *photo, depth, size) for photo in several]

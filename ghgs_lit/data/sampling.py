@@ -1,9 +1,9 @@
-"""Sampling of input views and targets, in training and evaluation.
+"""Sampling of input and target views in training and evaluation.
 
-A photograph is identified by its ring position and the number of the view there: 0 is the ring
-camera, 1 repeats the next ring camera, 3 is the exact middle between the two, 2 and 4 are random in
-the first and second half. Inputs are ring cameras (view 0). A sample depends on (seed, step, index)
-alone, so that a run resumes exactly, whatever the number of workers.
+An image is identified by its ring position and its view number there: 0 is the ring camera, 1 repeats
+the next ring camera, 3 is the exact middle between the two, 2 and 4 are at random places in the first
+and second half. Inputs are ring cameras (view 0). A sample depends only on (seed, step, index), so that
+a run resumes exactly, with any number of workers.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from ghgs_lit.errors import InputError, require
 
 RING_VIEW = 0
 MIDDLE_VIEW = 3
-# Independent streams of random numbers.
+# Keys of independent random streams.
 _ORDER = 0
 _COUNT = 1
 _SAMPLE = 2
@@ -32,19 +32,14 @@ Several = Annotated[int, Field(ge=2)]
 
 
 def subject_rng(seed: int, name: str) -> np.random.Generator:
-    """Random numbers of one subject, independent of other subjects.
-
-    Args:
-        seed: of the run.
-        name: of the subject.
-    """
+    """Random generator of one subject, which does not depend on other subjects."""
     digest = hashlib.sha256(name.encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Photographs of a subject that make one sample, and the protocol of each target."""
+    """The input and target images of a subject that form a sample, and the protocol of each target."""
 
     subject: str
     inputs: tuple[Photo, ...]
@@ -53,17 +48,17 @@ class Sample:
 
 
 def photo_name(photo: Photo) -> str:
-    """Name such as ``004/3`` for view 3 at position 4, as in the paths of rendered data."""
+    """Name of an image as in paths of rendered data, such as ``004/3`` for view 3 at position 4."""
     return f"{photo[0]:03d}/{photo[1]}"
 
 
 def ring_photos(positions: Sequence[int]) -> tuple[Photo, ...]:
-    """Photographs of the ring cameras at ``positions``."""
+    """Images of the ring cameras at ``positions``."""
     return tuple((position, RING_VIEW) for position in positions)
 
 
 class ViewProtocol(Options):
-    """Choice of input views."""
+    """Protocol of the input views."""
 
     group = "views"
 
@@ -72,22 +67,22 @@ class ViewProtocol(Options):
     evaluation_count: Several = 4
     """Number of input views in evaluation."""
     training: Literal["any", "even", "uneven"] = "any"
-    """any: ring cameras in random order. even: evenly spaced from a random start. uneven: evenly
-    spaced, then each moved by up to one position, as captures are."""
+    """Input views in training. any: ring cameras in random order. even: evenly spaced from a random start.
+    uneven: evenly spaced, then each moved by up to one position, as in captures."""
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
-        """Positions of the inputs of a training sample.
+        """Sample the input positions of a training sample.
 
         Args:
-            available: positions of the subject.
+            available: positions that the subject has.
             count: number of inputs.
             ring: number of positions of a full ring.
-            rng: source of random numbers.
+            rng: random generator.
         """
         if self.training != "any":
             start = int(rng.integers(ring))
             positions = np.asarray(even_positions(ring, count))
-            if self.training == "uneven":  # positions are at least 3 apart, so they stay different
+            if self.training == "uneven":  # positions are at least 3 apart, so they stay distinct
                 positions = positions + rng.integers(-1, 1, count, endpoint=True)
             return [int(position) for position in (start + positions) % ring]
         return [int(position) for position in rng.choice(np.asarray(available), count, replace=False)]
@@ -98,17 +93,17 @@ def even_positions(ring: int, count: int) -> list[int]:
 
     Args:
         ring: number of positions of a full ring.
-        count: number of positions that are chosen, at least 1.
+        count: number of positions to select, at least 1.
     """
     return [i * ring // count for i in range(count)]
 
 
 def middle(first: int, second: int, ring: int) -> Photo:
-    """Photograph half-way between two positions: at a ring camera or between two.
+    """Image half-way between two positions, at a ring camera or between two.
 
     Args:
-        first: position where the way begins.
-        second: position where it ends, further on along the ring.
+        first: first position.
+        second: second position, further along the ring.
         ring: number of positions of a full ring.
     """
     doubled = 2 * first + (second - first) % ring
@@ -116,29 +111,28 @@ def middle(first: int, second: int, ring: int) -> Photo:
 
 
 class TargetProtocol(Options):
-    """Choice of target views."""
+    """Protocol of the target views."""
 
     group = "targets"
 
     kind: Literal["release", "midway", "random", "cameras"]
-    """Targets of evaluation. release: view ``view`` at an input's position. midway: half-way
-    between an input and the next. random: any of training_views at any position, fixed by the
-    seed. cameras: view ``view`` at those of ``positions`` that are not inputs. Null: the value
-    of ``name``."""
+    """Targets of evaluation. release: ``view`` at the positions of inputs. midway: half-way between an
+    input and the next one. random: any of training_views at any position, fixed by the seed. cameras:
+    ``view`` at those of ``positions`` that are not inputs. Null: the value of ``name``."""
     name: Text
     """Name of the protocol in results."""
     view: ViewNumber = MIDDLE_VIEW
-    """View that release and cameras take at a position: 0 the ring camera, 3 the middle to the next
-    (release: 11.25 degrees from the input)."""
+    """View number of the targets of release and cameras: 0 is the ring camera, 3 the middle to the next one
+    (in release 11.25 degrees from the input)."""
     positions: tuple[Index, ...] | None = None
-    """Positions that cameras takes; null: all."""
+    """Positions of the targets of cameras; null: all."""
     per_subject: Count | Literal["all"] = 1
-    """Targets of each subject in evaluation, the first ones;
-    all: one next to every input, or every camera."""
+    """Number of targets of each subject in evaluation, the first ones; all: one next to every input, or
+    every camera."""
     training_views: tuple[ViewNumber, ...] = Field((0, 2, 3, 4), min_length=1)
-    """Numbers of the views that training draws from, at any position."""
+    """View numbers from which training samples targets, at any position."""
     per_step: Count = 1
-    """Targets that training draws for each sample."""
+    """Number of targets of each training sample."""
 
     @model_validator(mode="before")
     @classmethod
@@ -155,23 +149,23 @@ class TargetProtocol(Options):
 
     @property
     def view_numbers(self) -> set[int]:
-        """View numbers that training or evaluation may ask for."""
+        """View numbers that training or evaluation may require."""
         evaluated = {"midway": {RING_VIEW, MIDDLE_VIEW}, "random": set()}.get(self.kind, {self.view})
         return evaluated | set(self.training_views)
 
     def draw(
         self, available: Sequence[int], inputs: Sequence[int], count: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """Different photographs at positions of the subject that are not inputs.
+        """Sample different images of ``training_views`` that are not inputs.
 
         Args:
-            available: positions of the subject.
+            available: positions that the subject has.
             inputs: positions of the inputs.
-            count: number of photographs.
-            rng: source of random numbers.
+            count: number of images.
+            rng: random generator.
 
         Raises:
-            InputError: there are fewer.
+            InputError: fewer than ``count`` exist.
         """
         taken = ring_photos(inputs)
         everything = itertools.product(available, self.training_views)
@@ -188,10 +182,10 @@ class TargetProtocol(Options):
         """Targets of an evaluation sample.
 
         Args:
-            available: positions of the subject.
+            available: positions that the subject has.
             inputs: positions of the inputs, in their order on the ring.
             ring: number of positions of a full ring.
-            rng: source of random targets.
+            rng: random generator, for ``kind=random``.
 
         Raises:
             InputError: the subject lacks positions, or there are fewer targets than configured.
@@ -227,13 +221,13 @@ class TrainingSampler:
     """Endless sequence of training samples.
 
     Args:
-        subjects: camera positions by name.
-        views: choice of the inputs.
-        targets: choice of the targets.
+        subjects: camera positions of each subject.
+        views: protocol of the input views.
+        targets: protocol of the target views.
         ring: number of positions of a full ring.
-        batch_size: samples of each step and process.
-        seed: of the run.
-        class_steps: steps in a row with equal numbers of inputs.
+        batch_size: samples per step and process.
+        seed: seed of the run.
+        class_steps: number of consecutive steps with equal numbers of inputs.
 
     Raises:
         InputError: a subject has too few positions.
@@ -263,8 +257,8 @@ class TrainingSampler:
         """Samples of one process at a step, with equal numbers of inputs.
 
         Args:
-            step: of training.
-            rank: number of the process.
+            step: training step.
+            rank: index of the process.
             world: number of processes.
         """
         numbers = [self.seed, _COUNT, step // self.class_steps]
@@ -272,18 +266,12 @@ class TrainingSampler:
         return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
 
     def indices(self, step: int, rank: int = 0, world: int = 1) -> range:
-        """Numbers in the run of the samples of :meth:`batch`.
-
-        Args:
-            step: of training.
-            rank: number of the process.
-            world: number of processes.
-        """
+        """Indices in the run of the samples of :meth:`batch`."""
         first = (step * world + rank) * self.batch_size
         return range(first, first + self.batch_size)
 
     def _sample(self, step: int, index: int, count: int) -> Sample:
-        """Sample number ``index`` of the run, which takes all subjects in a new random order each epoch."""
+        """The sample at ``index`` of the run; each epoch uses all subjects in a new random order."""
         names = list(self.subjects)
         epoch, place = divmod(index, len(names))
         name = names[np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(names))[place]]
@@ -302,15 +290,15 @@ def evaluation_samples(
     seed: int,
     positions: Sequence[Sequence[int]] = (),
 ) -> list[Sample]:
-    """One fixed sample for each subject, with the targets of all ``protocols`` one after another.
+    """One fixed sample per subject, with the concatenated targets of all ``protocols``.
 
     Args:
-        subjects: camera positions by name.
+        subjects: camera positions of each subject.
         count: number of inputs, above 0.
-        protocols: choices of targets.
+        protocols: protocols of the target views.
         ring: number of positions of a full ring.
-        seed: of random targets.
-        positions: lists of input positions; evenly spaced if none has ``count``.
+        seed: seed of random targets.
+        positions: lists of input positions; if none has length ``count``, inputs are evenly spaced.
 
     Raises:
         InputError: input positions repeat, or a subject lacks one.

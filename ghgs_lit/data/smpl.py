@@ -1,7 +1,7 @@
 """Bodies from HuMMan's SMPL parameters, with the licensed SMPL_NEUTRAL and the package ``smplx``.
 
-No code of the model file is run: the chumpy and SciPy classes that pickles of the official release
-name are replaced by harmless ones that keep the arrays.
+No code of the model file is run: chumpy's and SciPy's classes in the pickles of the official release are
+replaced by harmless ones that only keep the arrays.
 """
 
 import contextlib
@@ -32,14 +32,14 @@ _FILE = "smpl/SMPL_NEUTRAL.pkl"
 
 
 class _Chumpy:
-    """Replacement of ``chumpy.ch.Ch``, whose array is ``x``."""
+    """Replacement for ``chumpy.ch.Ch``, whose array is ``x``."""
 
     def __setstate__(self, state: dict) -> None:
         self.array = np.asarray(state["x"])
 
 
 class _Sparse:
-    """Replacement of SciPy's compressed column matrices."""
+    """Replacement for SciPy's ``csc_matrix``, which keeps a dense array."""
 
     def __setstate__(self, state: dict) -> None:
         parts = (state["data"], state["indices"], state["indptr"])
@@ -47,7 +47,7 @@ class _Sparse:
 
 
 def _reconstruct(kind: type, base: type, state: Any) -> object:
-    """Object construction of protocols below 2, for the replacements above only."""
+    """Construct an object as protocols below 2 do, for the replacements above only."""
     if kind not in (_Chumpy, _Sparse):
         raise pickle.UnpicklingError(f"an object of {kind!r}")
     return kind.__new__(kind)
@@ -62,13 +62,10 @@ _REPLACEMENTS = {
 
 
 def read_model(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of an SMPL model file (Loper et al. 2015).
-
-    Args:
-        path: of ``SMPL_NEUTRAL.pkl``.
+    """Read the arrays of an SMPL model (Loper et al. 2015) from ``SMPL_NEUTRAL.pkl``.
 
     Raises:
-        InputError: the file or an array is missing or bad, or it names code.
+        InputError: the file or an array is missing or bad, or the file refers to code.
     """
     content = load_pickle(path, also=_REPLACEMENTS)
     if not isinstance(content, dict):
@@ -78,14 +75,11 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
-    """Parameters of one frame as float64 vectors.
-
-    Args:
-        path: of an ``.npz`` file with the vectors of :data:`PARAMETERS`.
+    """Read the vectors of :data:`PARAMETERS` of one frame from an ``.npz`` file, as float64.
 
     Raises:
-        InputError: the file is missing or broken, or a vector is missing, has another length or
-            is not finite.
+        InputError: the file is missing or broken, or a vector is missing, has another length or is not
+            finite.
     """
     require_file(path, "SMPL parameters")
     try:
@@ -102,13 +96,13 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
 
 
 class Body:
-    """SMPL_NEUTRAL from its file.
+    """The body model SMPL_NEUTRAL.
 
     Args:
-        path: of the file, or a folder with ``smpl/SMPL_NEUTRAL.pkl``.
+        path: its file, or a folder that contains ``smpl/SMPL_NEUTRAL.pkl``.
 
     Raises:
-        InputError: it is missing or bad, or ``smplx`` is missing.
+        InputError: the file is missing or bad, or ``smplx`` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,11 +114,11 @@ class Body:
 
     @torch.no_grad()
     def vertices(self, parameters: dict[str, np.ndarray]) -> np.ndarray:
-        """Vertices [6890, 3] float32 in the parameters' frame;
-        ``global_orient`` turns about the pelvis.
+        """Vertices [6890, 3] float32 in the coordinates of the parameters; ``global_orient`` rotates about
+        the pelvis.
 
         Args:
-            parameters: as of :func:`read_parameters`.
+            parameters: result of :func:`read_parameters`.
         """
         tensors = {key: torch.from_numpy(value).float()[None] for key, value in parameters.items()}
         return self.model(**tensors).vertices[0].numpy()
@@ -134,5 +128,5 @@ class Body:
 def _model(path: Path) -> torch.nn.Module:
     smplx = installed("smplx", "smpl", "data.smpl_model")
     struct = importlib.import_module("smplx.utils").Struct(**read_model(path))
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints how many shapes the model has
+    with contextlib.redirect_stdout(io.StringIO()):  # smplx prints the number of shape components
         return smplx.SMPL("", data_struct=struct, gender="neutral").eval()

@@ -15,15 +15,16 @@ Split = str | Path | Mapping[str, Sequence[str] | None]
 def split_names(
     source: Path, names: Sequence[str], split: Split | None, val_fraction: float, seed: int
 ) -> dict[str, list[str]]:
-    """Divide the scans of a folder.
+    """Divide the scans of a folder into ``train`` and ``val``.
 
     Args:
         source: folder of the scans.
         names: ids of all scans.
-        split: as for :func:`read_split`; None: the split files in ``source``, if there are any.
-        val_fraction: share of ``names`` for ``val`` without a split, in [0, 1];
-            at least one scan if above 0.
-        seed: of the draw without a split.
+        split: see :func:`read_split`; None: the split files in ``source``, or a random split if there are
+            none.
+        val_fraction: share of ``names`` in ``val`` for a random split, in [0, 1]; at least one scan if
+            above 0.
+        seed: seed of a random split.
 
     Returns:
         Ids by phase.
@@ -48,15 +49,15 @@ def split_names(
 
 
 def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
-    """Ids of ``train`` and ``val``.
+    """Read the ids of ``train`` and ``val``.
 
     Args:
-        split: a folder with ``split_train.txt`` and ``split_val.txt`` (one id a line), or a mapping
-            to ids and ranges of ``names`` such as ``0000-0425``.
+        split: a folder with ``split_train.txt`` and ``split_val.txt`` (one id per line), or a mapping
+            from phases to ids and to ranges of ``names`` such as ``0000-0425``.
         names: ids of all scans.
 
     Raises:
-        InputError: it is missing or malformed, or an id is in both.
+        InputError: the split is missing or malformed, or an id is in both phases.
     """
     if isinstance(split, Mapping):
         place: Path | str = "data.split"
@@ -77,7 +78,7 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _expand(entry: str, names: Sequence[str]) -> list[str]:
-    """The id, or all of ``names`` in a range of ids of equal length."""
+    """Expand a range of ids to all ``names`` of equal length in it; other entries are ids themselves."""
     first, dash, last = entry.partition("-")
     if not dash:
         return [entry]

@@ -1,8 +1,8 @@
-"""A photograph with its mask, depth and camera, and their resizing.
+"""An image with its mask, depth map and camera, and their resizing.
 
-Resizing keeps the middle of the image. ``release`` functions reproduce what the authors' code
-reads: OpenCV's nearest neighbour takes pixel floor(i * scale), which moves masks by half an old
-pixel less half a new one.
+Resizing preserves the image's centre. Functions named ``release_*`` reproduce the authors' code: OpenCV's
+nearest neighbour reads pixel floor(i * scale), which shifts masks by half an old pixel minus half a new
+one.
 """
 
 import itertools
@@ -16,58 +16,41 @@ from PIL import Image
 if TYPE_CHECKING:
     from scipy import sparse
 
-#: Largest relative difference of depths of one surface at neighbouring pixels.
+#: Maximum relative difference between depths of one surface at neighbouring pixels.
 SAME_SURFACE = 0.02
 
 
 def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized image: mean over the area of each new pixel; bicubic if it grows.
-
-    Args:
-        image: [h, w, ...] uint8.
-        height: of the result in pixels.
-        width: of the result in pixels.
-
-    Returns:
-        [height, width, ...] uint8.
-    """
+    """Resize an image [h, w, ...] uint8 to the mean over the area of each new pixel; bicubic if it is
+    enlarged."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
     if height > h or width > w:
         return release_image(image, height, width)
-    if h % height == w % width == 0:  # a quarter of the time of the general case
+    if h % height == w % width == 0:  # four times as fast as the general case
         return np.asarray(Image.fromarray(image).reduce((w // width, h // height)))
     means = _area_means(image.reshape(h, w, -1), height, width).reshape(height, width, *image.shape[2:])
     return np.floor(means + 0.5).astype(np.uint8)
 
 
 def area_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized mask: at least half of the new pixel's area is in the mask.
-
-    Args:
-        mask: [h, w] bool.
-        height: of the result in pixels.
-        width: of the result in pixels.
-
-    Returns:
-        [height, width] bool.
-    """
+    """Resize a mask [h, w] bool: true where the mask covers at least half of a new pixel's area."""
     if mask.shape == (height, width):
         return mask
     return _area_means(mask[..., None], height, width)[..., 0] > 0.5 - 1e-6
 
 
 def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Inverse depth at the centres of new pixels.
+    """Resize a map of inverse depth by sampling it at the centres of new pixels.
 
-    It is interpolated linearly (exact for planes) among those of the four old pixels that are known
-    and on the nearest surface.
+    Values are interpolated bilinearly (exact for planes) between those of the four neighbouring pixels
+    that are known and lie on the nearest surface.
 
     Args:
         inverse: [h, w] uint16, 2^15 / metres; 0 where unknown.
-        height: of the result in pixels.
-        width: of the result in pixels.
+        height: height of the result in pixels.
+        width: width of the result in pixels.
 
     Returns:
         [height, width] uint16.
@@ -92,30 +75,12 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def release_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized image by Pillow's bicubic filter.
-
-    Args:
-        image: [h, w, ...] uint8.
-        height: of the result in pixels.
-        width: of the result in pixels.
-
-    Returns:
-        [height, width, ...] uint8.
-    """
+    """Resize an image [h, w, ...] uint8 with Pillow's bicubic filter, as the authors' code does."""
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC))
 
 
 def release_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized mask by OpenCV's nearest neighbour.
-
-    Args:
-        mask: [h, w].
-        height: of the result in pixels.
-        width: of the result in pixels.
-
-    Returns:
-        [height, width].
-    """
+    """Resize a mask [h, w] with OpenCV's nearest neighbour, as the authors' code does."""
     h, w = mask.shape
     rows = np.arange(height) * h // height
     columns = np.arange(width) * w // width
@@ -123,7 +88,7 @@ def release_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _area_means(layers: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Means [height, width, c] float32 over the areas of new pixels, with exact weights."""
+    """Exactly weighted means over the areas of new pixels, [height, width, c] float32."""
     h, w, channels = layers.shape
     lines = area_weights(h, height) @ layers.reshape(h, w * channels).astype(np.float32)
     lines = np.moveaxis(lines.reshape(height, w, channels), 1, 0).reshape(w, height * channels)
@@ -132,16 +97,16 @@ def _area_means(layers: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def area_weights(old: int, new: int) -> "sparse.csr_array":
-    """Share of each new pixel that each old one covers, along one side.
+    """Share of each new pixel that each old pixel covers, along one side.
 
     Args:
-        old: pixels of the old side.
-        new: pixels of the new side.
+        old: number of pixels of the old side.
+        new: number of pixels of the new side.
 
     Returns:
         [new, old]; rows sum to 1.
     """
-    from scipy import sparse  # here: a wrong path is refused before it is needed
+    from scipy import sparse  # here, so that wrong paths are rejected before this slow import
 
     # in units of 1 / (old * new)
     edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)
@@ -152,11 +117,11 @@ def area_weights(old: int, new: int) -> "sparse.csr_array":
 
 
 def neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """The two old pixels around the centre of each new one, along one side.
+    """The two old pixels around the centre of each new pixel, along one side.
 
     Args:
-        old: pixels of the old side.
-        new: pixels of the new side.
+        old: number of pixels of the old side.
+        new: number of pixels of the new side.
 
     Returns:
         Indices [2, new] and linear weights [2, new].
@@ -173,7 +138,7 @@ DEPTH_SCALE = 1 << 15
 
 @dataclass(frozen=True)
 class View:
-    """A photograph and its camera.
+    """An image with its maps and camera.
 
     Attributes:
         image: [h, w, 3] uint8, RGB.
@@ -210,18 +175,18 @@ class View:
 
 @lru_cache(maxsize=1)
 def _depths() -> np.ndarray:
-    """Depth [65536] float32 in metres of each inverse depth; 0 for 0."""
+    """Table [65536] float32 of the depth in metres of each inverse depth; 0 for 0."""
     inverse = np.arange(1, 1 << 16)
     return np.concatenate(([0], DEPTH_SCALE / inverse)).astype(np.float32)
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Inverse depth uint16 of metres.
+    """Encode depth as inverse depth, uint16 of 2^15 / metres.
 
-    At 2 m a step is 0.12 mm; nearer than 0.5 m saturates.
+    At 2 m the resolution is 0.12 mm; depths below 0.5 m saturate.
 
     Args:
-        depth: metres, any shape; 0 where unknown, and stays 0.
+        depth: depth in metres, any shape; 0 where unknown, which stays 0.
     """
     known = depth > 0
     inverse = np.round(DEPTH_SCALE / np.where(known, depth, 1))
@@ -229,25 +194,21 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def half_centers(intrinsics: np.ndarray) -> np.ndarray:
-    """Convert intrinsics from pixel centres at integers to centres at +0.5.
-
-    Args:
-        intrinsics: [3, 3] in pixels.
-    """
+    """Convert intrinsics [3, 3] from pixel centres at integers to centres at +0.5."""
     return intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 def resize_view(view: View, size: tuple[int, int] | None, resampling: str = "area") -> View:
-    """Resize a photograph with its mask and depth map, and scale its intrinsics.
+    """Resize an image with its maps, and scale its intrinsics.
 
-    Mattes are resized like photographs, and the mask is then where they are at least half. Depth is
-    taken at the centres of new pixels.
+    Mattes are resized like images, and the mask is then true where they are at least half. Depth is
+    sampled at the centres of new pixels.
 
     Args:
-        view: the photograph.
-        size: new (height, width) in pixels; None: as it is.
-        resampling: ``area`` keeps everything in place; ``release``, as the authors' code, resizes
-            photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour.
+        view: the view to resize.
+        size: new (height, width) in pixels; None: unchanged.
+        resampling: ``area`` shifts nothing; ``release``, as in the authors' code, resizes images with
+            Pillow's bicubic filter and masks with OpenCV's nearest neighbour.
     """
     if size in (None, view.mask.shape):
         return view

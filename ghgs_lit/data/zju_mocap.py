@@ -1,14 +1,14 @@
 """Options and reader of ZJU-MoCap.
 
-``<root>/CoreView_<id>/`` holds ``annots.npy``, the photographs of each camera, ``mask_cihp/`` and
-sometimes ``mask/`` (label maps: any value but 0 is the subject), ``new_vertices/`` and ``vertices/``
-(<frame number>.npy: 6890 x 3, metres, world with z up).
+``<root>/CoreView_<id>/`` contains ``annots.npy``, the images of each camera, ``mask_cihp/`` and sometimes
+``mask/`` (label maps: all values except 0 are the subject), ``new_vertices/`` and ``vertices/`` (<frame
+number>.npy: 6890 x 3, metres, world with z up).
 
-``annots.npy`` is a pickled dictionary in an array without dimensions: ``cams`` with lists ``K``
-(3, 3), ``D`` (4 or 5 coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world
-to camera; ``ims`` with a dictionary for each frame, whose ``ims`` are the paths of its photographs in
-the order of the cameras. In sequences 313 and 315 these are the original long names, whose fifth
-field is the frame number from 1.
+``annots.npy`` is a pickled dictionary in an array without dimensions: ``cams`` with lists ``K`` (3, 3),
+``D`` (4 or 5 coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world to camera;
+``ims`` with a dictionary for each frame, whose ``ims`` are the paths of its images in the order of the
+cameras. In sequences 313 and 315 these are the original long names, whose fifth field is the frame number
+from 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,24 +28,21 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.parsing import find_path
 
 MILLIMETRE = 0.001
-# Metres: cameras that are closer together were not given in millimetres.
+# Distance in metres below which cameras were not given in millimetres.
 _NEAREST = 0.1
 BODY_VERTICES = 6890
-#: Folders of vertices, of which the first existing one is read.
+#: Folders of vertices; the first one that exists is read.
 _BODIES = ("new_vertices", "vertices")
 
 
 def read_annotations(path: Path) -> tuple[list[Camera], list[tuple[PurePosixPath, ...]]]:
     """Read and check an ``annots.npy``.
 
-    Args:
-        path: of the file.
-
     Returns:
-        The cameras of the sequence, and for each frame the paths of their photographs.
+        The cameras of the sequence, and for each frame the paths of their images.
 
     Raises:
-        InputError: it is missing, unsafe or broken, or an entry is bad.
+        InputError: the file is missing, unsafe or broken, or an entry is bad.
     """
     content = load_npy(path)
     cams = _entry(path, content, "cams")
@@ -80,8 +77,8 @@ def _entry(place: Path | str, content: Any, key: str) -> Any:
 
 
 def _photographs(place: str, entry: Any, cameras: int) -> tuple[PurePosixPath, ...]:
-    """Paths of the photographs of a frame in the order of the cameras; none may leave the sequence, and
-    all have one frame number."""
+    """Check the paths of a frame's images, in the order of the cameras: none may lead out of the sequence,
+    and all must have the same frame number."""
     names = _entry(place, entry, "ims")
     if len(names) != cameras:
         raise InputError(f"{place}: expected a photograph for each of {cameras} cameras; found {len(names)}")
@@ -96,13 +93,10 @@ def _photographs(place: str, entry: Any, cameras: int) -> tuple[PurePosixPath, .
 
 
 def frame_number(name: PurePath) -> int:
-    """Frame number in a photograph's name; files of bodies are named after it.
-
-    Args:
-        name: path of the photograph.
+    """Frame number in the name of an image, by which files of bodies are named.
 
     Raises:
-        InputError: there is none.
+        InputError: the name has no frame number.
     """
     field = frame_field(name)
     if not field.isdecimal():
@@ -113,14 +107,14 @@ def frame_number(name: PurePath) -> int:
 
 
 def frame_field(name: PurePath) -> str:
-    """Frame number as written in a name: ``000012``,
-    or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
+    """Frame number as written in the name of an image: ``000012``, or ``0001`` in
+    ``…_Camera_(1)_0001_2019-…``."""
     fields = name.stem.split("_")
     return fields[4] if len(fields) > 4 else name.stem
 
 
 class ZJUMoCapReader(FrameReader):
-    """Chosen frames of ZJU-MoCap; wanted numbers of frames are indices in ``annots.npy``."""
+    """Reader of ZJU-MoCap frames, selected by their indices in ``annots.npy``."""
 
     calibration = "annots.npy"
 
@@ -170,21 +164,20 @@ class ZJUMoCapReader(FrameReader):
 
 
 def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
-    """File of a photograph, under its name or its frame field alone (renamed files of
-    313 and 315)."""
+    """Path of an image, under its name or only its frame field (renamed files of 313 and 315)."""
     usual = photograph.with_suffix(suffix)
     renamed = usual.with_name(frame_field(photograph) + suffix)
     return find_path(folder, str(usual)) or find_path(folder, str(renamed)) or folder / usual
 
 
 class Frames(Options):
-    """Frames of several sequences."""
+    """A range of frames in several sequences."""
 
     sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...] = Field(min_length=1)
     """Ids, such as 377."""
     frames: tuple[Index, Index, Count]
-    """[start, stop, step] of the indices in annots.npy, from 0. A shorter sequence gives the
-    frames that it has, as in the published loaders."""
+    """[start, stop, step] of the indices in annots.npy, from 0. Frames beyond the end of a sequence are
+    skipped, as in the published loaders."""
 
     @model_validator(mode="after")
     def _check(self) -> "Frames":
@@ -192,7 +185,7 @@ class Frames(Options):
         return self
 
 
-# Assumed number of cameras if all are used; some sequences have 23.
+# Number of cameras assumed if all are used; some sequences have 23.
 _ALL = 21
 
 
@@ -206,7 +199,7 @@ class FramesByPhase(Options):
 
 
 class ZJUMoCap(DataSet):
-    """Downloaded ZJU-MoCap sequences below ``root``; a subject is one frame of one sequence."""
+    """Downloaded ZJU-MoCap sequences below ``root``; each frame of a sequence is a subject."""
 
     published: ClassVar[Mapping[str, int]] = {"train": 6, "val": 3}
     static_cameras: ClassVar[bool] = True
@@ -214,14 +207,14 @@ class ZJUMoCap(DataSet):
     name: Text = "zju_mocap"
     size: Size = 512
     split: FramesByPhase
-    """Sequences of each phase, and which of their frames."""
+    """Sequences and frames of each phase."""
     cameras: Annotated[int, Field(ge=2)] | None = 20
-    """Cameras used of each sequence, the first ones, which make up the ring;
-    null: all, a ring of 21."""
+    """Number of cameras used of each sequence, the first ones, which form the ring; null: all, with a ring
+    of 21."""
     undistorted: bool = True
-    """Remove the lens distortion of photographs and masks (SHERF does not, most others do)."""
+    """Remove the lens distortion of images and masks (SHERF does not, most others do)."""
     masks: tuple[Text, ...] = Field(("mask_cihp",), min_length=1)
-    """Folders of label maps; those that a sequence has are united."""
+    """Folders of label maps, whose union is the mask; folders that a sequence lacks are skipped."""
 
     @property
     def ring(self) -> int:

@@ -1,11 +1,11 @@
-"""Mattes of photographs whose masks are a few pixels off, ragged or have holes.
+"""Matting of images whose masks are a few pixels off, ragged, or have holes.
 
-A mask that is off by a pixel paints colours of the background, different in each view, on the
-subject's outline. A network estimates the matte from photograph and mask: a U-Net (Ronneberger et
-al., MICCAI 2015) with a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR
-2017), and the differences of each colour from those of subject and background nearby. It was
-trained on generated people before many kinds of backgrounds (by ``scripts/bake_matting.py`` of commit
-46b85d02).
+A mask that is off by a pixel adds colours of the background, which differ between views, to the
+subject's outline. A network estimates the matte from the image and the mask: a U-Net (Ronneberger et
+al., MICCAI 2015) whose inputs are the colours, the rough mask, as in Deep Image Matting (Xu et al.,
+CVPR 2017), and the differences of each colour from nearby colours of the subject and the background. It
+was trained on generated people in front of many kinds of backgrounds (by ``scripts/bake_matting.py`` of
+commit 46b85d02).
 """
 
 import functools
@@ -22,20 +22,20 @@ from torch import Tensor, nn
 from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.geometry.precision import exact
 
-#: Channels at the full size of the image and at each half of it.
+#: Channels at the full size of the image and at each halving.
 _WIDTHS = (16, 32, 48, 64)
-#: Pixels at which the distance from the mask's outline is clipped.
+#: Distance from the mask's outline, in pixels, at which it is clipped.
 FARTHEST = 8.0
-#: Colours nearby are averaged in images smaller by this factor, over squares of these sides, twice.
+#: Nearby colours are averaged twice over squares of these sides, in images smaller by this factor.
 _COARSER = 4
 _SIDES = (3, 7)
-#: Channels: colours, mask, distance from its outline;
-#: differences from colours inside and outside nearby.
+#: Input channels: colours, mask, distance from its outline, and differences from nearby colours inside
+#: and outside.
 _FEATURES = 5 + 3 * 2 * len(_SIDES)
 
 
 class MattingNetwork(nn.Module):
-    """U-Net for mattes and colours of the subject."""
+    """U-Net that predicts mattes and the subject's colours."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,14 +48,14 @@ class MattingNetwork(nn.Module):
     def forward(
         self, images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
     ) -> tuple[Float[Tensor, "B h w"], Float[Tensor, "B 3 h w"]]:
-        """Mattes and the subject's colours multiplied by them.
+        """Predict mattes and premultiplied colours of the subject.
 
         Args:
-            images: photographs with background, in [0, 1].
+            images: images with their background, in [0, 1].
             mattes: rough mattes in [0, 1], such as masks of 0 and 1.
 
         Returns:
-            Mattes (in [0, 1] in evaluation only), and colours.
+            Mattes (limited to [0, 1] only in evaluation), and the subject's colours multiplied by them.
         """
         height, width = images.shape[2:]
         whole = 2 ** (len(_WIDTHS) - 1)
@@ -68,11 +68,10 @@ class MattingNetwork(nn.Module):
         for block in reversed(self.up):
             x = block(torch.cat((finer.pop(), F.interpolate(x, scale_factor=2.0, mode="nearest")), 1))
         out = self.out(x)[..., :height, :width].float()
-        # A correction of up to 1.1 can invert a mask; the initial one is 0.
+        # A correction of up to 1.1 can invert a mask; initially it is 0.
         estimate = mattes + 1.1 * torch.tanh(out[:, 0])
         share = estimate.clamp(0, 1)
-        # A pixel mixes the colours of subject and background;
-        # the network predicts their difference.
+        # A pixel mixes the colours of subject and background; the network predicts their difference.
         colors = images + (1 - share.detach())[:, None] * out[:, 1:]
         if not self.training:
             estimate = share
@@ -89,8 +88,7 @@ def _convolutions(before: int, after: int) -> nn.Sequential:
 def _features(
     images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
 ) -> Float[Tensor, "B features h w"]:
-    """Colours, mask, distance from its outline,
-    and differences from colours inside and outside nearby."""
+    """Input channels of the network (:data:`_FEATURES`)."""
     with exact(images.device.type):
         inside = np.stack([_insideness(mask) for mask in (mattes > 0.5).cpu().numpy()])
         depth = torch.from_numpy(inside).to(images)[:, None]
@@ -104,13 +102,12 @@ def _features(
 
 
 def _insideness(mask: np.ndarray) -> np.ndarray:
-    """Signed distance from the outline over :data:`FARTHEST`, in [-1, 1], positive inside;
-    float32."""
+    """Signed distance from the outline divided by :data:`FARTHEST`, in [-1, 1], positive inside, float32."""
     return (signed_distance(mask) / FARTHEST).clip(-1, 1).astype(np.float32)
 
 
 def _near(sums: Float[Tensor, "B 4 m n"], side: int, size: torch.Size) -> Float[Tensor, "B 3 h w"]:
-    """Weighted means of colours in squares; black if all weights are 0."""
+    """Weighted means of nearby colours; black if all weights are 0."""
     for _ in range(2):
         sums = F.avg_pool2d(sums, side, 1, side // 2)
     means = sums[:, :3] / (sums[:, 3:] + 1e-4)
@@ -119,32 +116,31 @@ def _near(sums: Float[Tensor, "B 4 m n"], side: int, size: torch.Size) -> Float[
 
 #: The network's weights in half precision.
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-#: Pixels of context around those that may change.
+#: Context in pixels around those that may change.
 _AROUND = 16
 
 
 def refined_matte(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], pixels: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """Subject on black (premultiplied), and its refined matte.
+    """Refine a matte, and extract the subject on black.
 
     Args:
-        image: photograph with its background; best if the subject is 170 to 330 pixels tall, as in
+        image: image with its background; works best if the subject is 170 to 330 pixels tall, as in
             training.
-        matte: 255 times the share of each pixel that shows the subject,
-            such as 0 and 255 of a mask.
-        pixels: greatest error of the outline, above 0 (8 in training); holes of twice that width
-            may be filled.
+        matte: 255 times the share of each pixel that shows the subject, such as a mask of 0 and 255.
+        pixels: maximum error of the outline, above 0 (8 in training); holes of up to twice this width
+            can be filled.
 
     Returns:
-        Image and matte of the same sizes.
+        Premultiplied image and refined matte, of the same sizes.
     """
     window = _window(matte > 127, int(pixels) + _AROUND)
     colors = torch.from_numpy(image[window] / np.float32(255))
     given = torch.from_numpy(matte[window] / np.float32(255))
     with torch.inference_mode():
         estimate, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
-    # Pixels near enough to the outline to change.
+    # Pixels close enough to the outline to change.
     is_open = np.abs(signed_distance(matte[window] > 127)) + 0.5 <= pixels
     result = np.zeros_like(image), np.zeros_like(matte)
     kept = given.numpy(), (given[..., None] * colors).numpy()
@@ -163,7 +159,6 @@ def _network() -> MattingNetwork:
 
 
 def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """The box around what is inside, with a margin in pixels;
-    everything where nothing is inside."""
+    """Box around the true pixels with a margin in pixels; the whole image if there are none."""
     lines = (np.nonzero(inside.any(axis))[0] for axis in (1, 0))
     return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)
