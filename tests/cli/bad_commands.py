@@ -1,8 +1,8 @@
-"""Commands that cannot work, by what is wrong with them.
+"""Invalid commands, grouped by what is wrong with them.
 
-A row is a command, its exit code, and parts of its line: the path or key, what was expected, what
-was found. ``{tmp}`` is the folder of the test; the files in braces are made by the fixture
-``files`` of ``test_bad_commands``.
+A row is a command, its exit code, and parts of its message: the path or key, what was expected, and what
+was found. ``{tmp}`` is the folder of the test; the files in braces are created by the fixture ``files``
+of ``test_bad_commands``.
 """
 
 USAGE = [
@@ -231,7 +231,7 @@ SYSTEM = [
     ),
 ]
 
-# Values without end would run until somebody kills them, or take all memory.
+# Unlimited values would run until killed, or exhaust memory.
 ENDLESS = [
     ("benchmark data=synthetic timing.repeats=1000000000", 1, "timing.repeats: expected", "<= 1000"),
     ("stress workers=1000000000", 1, "workers: expected", "<= 1024"),
@@ -240,7 +240,7 @@ ENDLESS = [
     ("train 'trainer.max_time={{hours: 1e300}}'", 1, "trainer.max_time: expected days:hours"),
 ]
 
-# What is checked before any photograph is rendered, and what would destroy a run.
+# Checks before any image is rendered, and protection of existing runs.
 EARLY = [
     ("train evaluation.targets=[relase]", 1, "evaluation.targets: expected one of", "did you mean release?"),
     ("train evaluation.split=foo", 1, "evaluation.split: expected", "'foo'"),

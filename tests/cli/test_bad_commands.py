@@ -1,4 +1,4 @@
-"""Commands that cannot work, of every verb: an exit code and one line, never a traceback."""
+"""Invalid commands of every verb: an exit code and a one-line message, never a traceback."""
 
 import errno
 import os
@@ -25,7 +25,7 @@ from tests.helpers.verbs import ghgs
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Files and folders that commands name, by their names in rows."""
+    """Files and folders by their names in rows."""
     folder = tmp_path_factory.mktemp("files")
     places = {name: folder / name for name in ("ckpt", "text", "empty", "list", "tensors", "hollow", "newer")}
     places["broken"] = folder / "broken"
@@ -50,11 +50,11 @@ def files(tmp_path_factory):
 
 
 def call(monkeypatch, capfd, tmp_path, command: str) -> tuple[int, str]:
-    """The exit code and the standard error of ``ghgs <command>`` in the folder ``tmp_path``."""
+    """Exit code and standard error of ``ghgs <command>`` in the folder ``tmp_path``."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
-    # Rendering takes minutes, so all that can be checked is checked before.
+    # Rendering takes minutes, so every possible check must precede it.
     started = AssertionError("work started before all was checked")
     monkeypatch.setattr(datasets, "render_people", Mock(side_effect=started))
     GlobalHydra.instance().clear()
@@ -70,13 +70,12 @@ def call(monkeypatch, capfd, tmp_path, command: str) -> tuple[int, str]:
 def test_a_bad_command_gets_its_exit_code_and_one_line(
     monkeypatch, capfd, tmp_path, files, command, expected, parts
 ):
-    """Users and scripts must learn what was wrong: the path or key, what was expected,
-    what was found."""
+    """The message contains the path or key, what was expected and what was found."""
     names = {**files, "tmp": tmp_path}
     code, text = call(monkeypatch, capfd, tmp_path, command.format(**names))
     assert code == expected, text
     assert "Traceback" not in text
-    if command:  # without a verb it is the usage
+    if command:  # without a verb, usage is printed
         assert len(text.strip().splitlines()) == 1, text
     for part in parts:
         assert part.format(**names) in text
@@ -96,7 +95,7 @@ def test_a_bad_command_gets_its_exit_code_and_one_line(
 def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
     monkeypatch, capfd, tmp_path, files, command, number
 ):
-    """A full disk or a read-only folder ended in a traceback without the path."""
+    """Regression: a full disk or a read-only folder ended in a traceback without the path."""
 
     def refuse(*_):
         raise OSError(number, os.strerror(number))
@@ -112,14 +111,14 @@ def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
 
 
 def test_threads_say_nothing_of_a_full_disk(capfd):
-    """TensorBoard's printed a traceback, beside the line of the error that it raises later."""
+    """Regression: TensorBoard's thread printed a traceback in addition to the error that it raises later."""
     for number in (errno.ENOSPC, errno.EIO):
         messages.print_of_thread(threading.ExceptHookArgs((OSError, OSError(number, "x"), None, None)))
     assert capfd.readouterr().err.count("OSError") == 1
 
 
 def test_weights_that_do_not_fit_the_disk_are_one_line_with_their_path(monkeypatch, capfd, tmp_path, files):
-    """PyTorch reports a full disk by an error of its own; here files may have 64 KiB."""
+    """PyTorch reports a full disk with its own error; here files are limited to 64 KiB."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, before[1]))
     try:
@@ -140,7 +139,7 @@ def test_weights_that_do_not_fit_the_disk_are_one_line_with_their_path(monkeypat
     ],
 )
 def test_a_signal_is_an_exit_code_and_one_line(tmp_path, number, expected):
-    """Scripts and batch systems tell an interrupted verb from one that failed or succeeded."""
+    """Scripts and batch systems distinguish interrupted, failed and successful verbs."""
     command = "ghgs prepare data.people.train=5000 data.render_workers=0"
     command += f" data.cache_dir={tmp_path / 'cache'} hydra.run.dir={tmp_path / 'run'}"
     process, output = start_verb(command, tmp_path, os.environ)
@@ -160,7 +159,7 @@ def test_a_signal_is_an_exit_code_and_one_line(tmp_path, number, expected):
 
 
 def test_a_working_directory_that_is_gone(monkeypatch, capfd, tmp_path):
-    """A job whose folder was deleted meanwhile; help needs none."""
+    """A job whose folder has been deleted; help works without a working directory."""
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()

@@ -1,4 +1,4 @@
-"""The model of a checkpoint after the command line, its data, and the device."""
+"""The model of a checkpoint after command-line changes, its data, and the device."""
 
 import copy
 
@@ -29,7 +29,7 @@ def checkpoint(tmp_path_factory):
 
 @pytest.fixture
 def composed(monkeypatch):
-    """Composes a verb as the command line does, after which its overrides are known."""
+    """Compose a verb as on the command line, so that its overrides are available."""
 
     def composed(verb, *overrides):
         cfg = compose(verb, _for_hydra(verb, list(overrides)), with_hydra=True)
@@ -43,15 +43,14 @@ def composed(monkeypatch):
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_a_checkpoint_is_not_changed_by_what_a_verb_composes(composed, checkpoint, verb):
-    """The defaults of a verb describe another model: only what was said counts."""
+    """The defaults of a verb describe another model: only explicit overrides count."""
     run = composed(verb, f"checkpoint={checkpoint}")
     assert inputs.model_of(checkpoint, run) == config(*TRAINED)
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, verb):
-    """Options that need no other weights change the model that is measured,
-    with all that follows them."""
+    """Options that do not require other weights change the model, with everything derived from them."""
     said = [
         "skip=none",
         "recalibration.k=2",
@@ -78,7 +77,7 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
     ],
 )
 def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb, said, height):
-    """Four fifths of its photographs, whatever they are used for or trained further with."""
+    """Four fifths of the training images' height, whatever the weights are used for or fine-tuned on."""
     path = str(tmp_path / "recurrent.ckpt")
     write_checkpoint(path, {}, {**config("model=recurrent"), "data": {"size": 42}})
     run = composed(verb, f"checkpoint={path}", *said)
@@ -98,7 +97,7 @@ def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb,
     ],
 )
 def test_a_key_that_the_rounds_of_a_checkpoint_lack_is_refused(composed, tmp_path, model, said, refused):
-    """Null was taken for the value of a key that is not there, and acted on nothing."""
+    """Regression: null was treated as the value of a missing key, and had no effect."""
     path = str(tmp_path / "trained.ckpt")
     write_checkpoint(path, {}, config(f"model={model}"))
     with pytest.raises(InputError, match=refused):
@@ -118,20 +117,20 @@ def test_a_key_that_the_rounds_of_a_checkpoint_lack_is_refused(composed, tmp_pat
     ],
 )
 def test_what_the_weights_were_trained_for_is_refused(composed, checkpoint, said, refused):
-    """An option that cannot act must not be recorded as if it had."""
+    """An option that cannot take effect must not be recorded as if it had."""
     run = composed("evaluate", f"checkpoint={checkpoint}", said)
     with pytest.raises(InputError, match=refused):
         inputs.model_of(checkpoint, run)
 
 
 def test_what_agrees_with_the_checkpoint_is_accepted(composed, checkpoint):
-    """Saying again what was trained changes nothing."""
+    """Repeating trained values changes nothing."""
     run = composed("evaluate", f"checkpoint={checkpoint}", "model=hull", "compat=none", "ablation=full")
     assert inputs.model_of(checkpoint, run) == config(*TRAINED)
 
 
 def test_a_stage_that_is_no_mapping_is_named(composed, tmp_path):
-    """A checkpoint of another program must not end in a traceback."""
+    """A foreign checkpoint must not end in a traceback."""
     path = str(tmp_path / "b.ckpt")
     write_checkpoint(path, {}, {**config(), "encoder": "vggt_nano"})
     said = r"b\.ckpt: config\.encoder: expected a mapping of its keys; found 'vggt_nano'"
@@ -141,7 +140,7 @@ def test_a_stage_that_is_no_mapping_is_named(composed, tmp_path):
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_data_that_moved_are_one_override(composed, checkpoint, verb):
-    """``data.root=`` alone acts on the data that a checkpoint was trained on."""
+    """``data.root=`` alone applies to the data that a checkpoint was trained on."""
     run = composed(verb, f"checkpoint={checkpoint}", "data.root=new")
     found = inputs.with_trained_data(run).plain["data"]
     assert found.items() >= {"kind": "scans", "root": "new", "size": 42}.items()
@@ -154,7 +153,7 @@ def test_data_that_moved_are_one_override(composed, checkpoint, verb):
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_data_that_are_not_here_are_named_by_their_key(composed, checkpoint, monkeypatch, tmp_path, verb):
-    """``old: expected the folder of the data set`` did not say where that name came from."""
+    """Regression: ``old: expected the folder of the data set`` did not mention the origin of the path."""
     monkeypatch.chdir(tmp_path)
     expected = (
         r"data\.root: expected data\.root=<folder>, .*a\.ckpt is not where .*; found no such folder 'old'"
@@ -166,8 +165,8 @@ def test_data_that_are_not_here_are_named_by_their_key(composed, checkpoint, mon
 
 
 def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
-    """``rounds.hidden=65536`` of a checkpoint allocated 150 GB before it was compared with
-    the weights."""
+    """Regression: ``rounds.hidden=65536`` in a checkpoint allocated 150 GB before the comparison with its
+    weights."""
     path, settings = tmp_path / "a.ckpt", config("model=recurrent")
     state = GHGS.from_config(settings).state_dict()
     write_checkpoint(path, state, {**settings, "rounds": {**settings["rounds"], "hidden": 65536}})
@@ -181,8 +180,7 @@ def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
 
 
 def test_targets_on_the_command_line_are_measured_alone(composed):
-    """``targets=midway`` is the switch that its name says;
-    evaluation.targets is for several protocols."""
+    """``targets=midway`` evaluates this protocol; evaluation.targets is for several protocols."""
     found = inputs.with_chosen_targets(composed("evaluate", "targets=midway"))
     assert found.evaluation.targets == ("midway",)
     for said in ([], ["targets.per_subject=2"], ["targets=ghg", "evaluation.targets=[release,midway]"]):
@@ -192,7 +190,7 @@ def test_targets_on_the_command_line_are_measured_alone(composed):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 def test_a_device_or_renderer_that_is_not_there_is_refused():
-    """A run on the CPU must not pass for one on a GPU, and gsplat's absence is one line."""
+    """A run on the CPU must not pass for one on a GPU, and missing gsplat is a one-line error."""
     with pytest.raises(
         InputError, match="device: expected auto or cpu on a machine without CUDA; found 'cuda'"
     ):

@@ -1,4 +1,4 @@
-"""The command line: verbs, one-line errors, exit codes."""
+"""The command line: verbs, one-line errors and exit codes."""
 
 import logging
 import os
@@ -24,14 +24,14 @@ from tests.helpers.verbs import ghgs
 
 
 def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
-    """The exit code, the standard output and the standard error of ``ghgs <argv>``."""
+    """Exit code, standard output and standard error of ``ghgs <argv>``."""
     GlobalHydra.instance().clear()
     code = ghgs(*argv)
     return code or 0, *capsys.readouterr()
 
 
 def test_a_warning_of_ours_is_a_line_and_others_say_where_they_are_from(capsys):
-    """Also once Lightning has put its own text of warnings in their place."""
+    """Also after Lightning has replaced the format of warnings."""
     run = """
 import sys, warnings
 from ghgs_lit.cli import main
@@ -47,8 +47,8 @@ for file in (main.__file__, "/elsewhere/ghgs_lit/.venv/torch.py"):
 
 
 def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, capsys):
-    """A verb without a module or a configuration would fail only when a user calls it;
-    checkpoints are named where training writes them."""
+    """A verb without a module or configuration would fail only in use; example checkpoints have the paths
+    that training writes."""
     code, out, _ = call(monkeypatch, capsys, "--help")
     assert code == 0
     for verb in verbs():
@@ -59,7 +59,7 @@ def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, 
 
 
 def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_path):
-    """Only bad input is one line: a bug must not look like it."""
+    """Only bad input is reported on one line; a bug must not look like it."""
 
     def run(self, *_):
         raise KeyError("bug")
@@ -70,7 +70,7 @@ def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_pat
 
 
 def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
-    """Groups with their default, keys with meaning and range; options of one's own folder, too."""
+    """Groups with their default, keys with meaning and range, including options of the user's folder."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "my_people.yaml").write_text("# Mine.\nkind: scans\n")
     flags = ("model=paper", "--config-dir", str(tmp_path))
@@ -104,7 +104,7 @@ def test_help_of_every_verb_names_its_keys(monkeypatch, capsys, verb):
 
 
 def test_what_lightning_says_of_itself_is_not_shown():
-    """Its lines came twice, and its advice is for other programs."""
+    """Lightning's messages appeared twice, and its advice does not apply."""
     from ghgs_lit.cli.train import quiet
 
     with warnings.catch_warnings(record=True) as shown:
@@ -125,21 +125,21 @@ def test_a_reader_that_closes_the_pipe_gets_no_traceback():
 
 @pytest.mark.parametrize("arguments", ["--version", "prepare --cfg job"])
 def test_closed_output_is_no_error(arguments):
-    """Schedulers and daemons close it."""
+    """Schedulers and daemons close standard output."""
     command = f"{sys.executable} -m ghgs_lit {arguments} >&-"
     done = subprocess.run(command, shell=True, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_prediction_goes_where_out_says():
-    """Else into a folder of its own."""
+    """Without ``out``, a prediction has a new folder."""
     for overrides, expected in ((["out=/a b/c"], "/a b/c"), ([], "runs/predict/")):
         directory = compose("predict", overrides, with_hydra=True).hydra.run.dir
         assert directory.startswith(expected)
 
 
 def test_a_prediction_does_not_wait_for_what_training_needs():
-    """Lightning, torchmetrics and PyTorch's compiler take seconds to import."""
+    """Importing Lightning, torchmetrics and PyTorch's compiler takes seconds."""
     imports = "import sys, ghgs_capture.verbs.predict, ghgs_lit"
     code = f"{imports}; ghgs_lit.Predictor.from_checkpoint(); print(*sys.modules)"
     loaded = set(run_python(code).stdout.split())
@@ -148,8 +148,7 @@ def test_a_prediction_does_not_wait_for_what_training_needs():
 
 
 def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
-    """Lightning starts the other processes of a DDP job by sys.argv,
-    which must contain the verb."""
+    """Lightning starts the other processes of a DDP job with sys.argv, which must contain the verb."""
     seen = {}
 
     def run(self):
@@ -166,8 +165,7 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
 
 
 def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_path):
-    """A sweep of many runs must not print thousands of lines of configuration;
-    the file has it all."""
+    """A sweep must not print thousands of lines of configuration, which its files contain."""
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     run = run_of("stress", ["quick=true"])
     write_config(run, tmp_path)
@@ -177,19 +175,19 @@ def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_pa
 
 
 def test_flags_may_stand_anywhere():
-    """Hydra takes none between overrides."""
+    """Hydra accepts no flags between overrides."""
     flags, overrides, _ = parsed(["seed=1", "-m", "--config-dir", "x", "seed=2"])
     assert (flags, overrides) == (["-m", "--config-dir", "x"], ["seed=1", "seed=2"])
     assert parsed(["--cfg=job", "seed=1"])[:2] == (["--cfg=job"], ["seed=1"])
 
 
 class Seeded(BaseException):
-    """Ends a verb where it sets the random numbers of the process."""
+    """Ends a verb at the point where it seeds the process."""
 
 
 @pytest.mark.parametrize("verb", ["train", "pretext"])
 def test_random_numbers_of_a_process_are_those_of_the_seed(monkeypatch, capsys, tmp_path, verb):
-    """The first weights of a model are random."""
+    """Initial weights of a model are random."""
 
     def ended(seed, **options):
         raise Seeded(seed)
@@ -210,7 +208,7 @@ def test_random_numbers_of_a_process_are_those_of_the_seed(monkeypatch, capsys, 
     ],
 )
 def test_a_wrong_value_leaves_no_run(monkeypatch, capsys, tmp_path, arguments):
-    """A list of runs is not full of those that never began."""
+    """The list of runs must not fill up with runs that never began."""
     monkeypatch.chdir(tmp_path)
     assert ghgs(*arguments, "hydra.run.dir=run") == 1
     assert "nowhere" in capsys.readouterr().err
@@ -226,7 +224,7 @@ def test_a_wrong_value_leaves_no_run(monkeypatch, capsys, tmp_path, arguments):
     ],
 )
 def test_what_was_there_before_an_error_stays(tmp_path, name, command):
-    """Also an empty folder, and a file of a run that was trained earlier."""
+    """Including an empty folder, and a file of an earlier run."""
     path, run = tmp_path / name, tmp_path / "run"
     run.mkdir()
     if path != run:
@@ -237,12 +235,11 @@ def test_what_was_there_before_an_error_stays(tmp_path, name, command):
 
 
 def test_hydras_files_are_written_and_through_no_link(tmp_path, monkeypatch, capsys):
-    """A run's folder of a stranger may hold links to files of the user,
-    which Hydra itself would empty."""
+    """An untrusted run folder may contain links to the user's files, which Hydra itself would overwrite."""
     run, precious = tmp_path / "run", tmp_path / "precious"
     run.mkdir()
     precious.write_text("precious")
-    (run / "notes").touch()  # a directory that holds more is kept
+    (run / "notes").touch()  # a directory with other files is kept
     arguments = ("table", f"runs={tmp_path}", "layout=table2", f"hydra.run.dir={run}")
     call(monkeypatch, capsys, *arguments)
     files = {path.stem: OmegaConf.load(path) for path in (run / ".hydra").iterdir()}

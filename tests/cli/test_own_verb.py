@@ -1,4 +1,4 @@
-"""A verb of one's own: one class in a file outside of the package."""
+"""A user-defined verb: one class in a file outside the package."""
 
 import sys
 
@@ -31,7 +31,7 @@ class Greet(Verb):
 
 @pytest.fixture(autouse=True)
 def plug_in(tmp_path, monkeypatch):
-    """The file in the user's folder, which the environment names."""
+    """Write the plug-in to the user's folder and select it by the environment variable."""
     (tmp_path / "own_verb.py").write_text(FILE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -42,7 +42,7 @@ def plug_in(tmp_path, monkeypatch):
 
 
 def test_it_runs_with_its_own_keys(tmp_path, capsys):
-    """Without a YAML; its directory and its saved start are those of any verb."""
+    """Without a YAML file; its directory and its saved start are as for any verb."""
     assert ghgs("greet", "name=Ada", "times=3", f"hydra.run.dir={tmp_path / 'run'}") == 0
     assert capsys.readouterr().out == "hello Ada hello Ada hello Ada\n"
     assert "times: 3" in (tmp_path / "run" / ".hydra" / "config.yaml").read_text()
@@ -71,7 +71,7 @@ def test_a_sweep_of_it_runs_every_combination(capsys):
 
 @pytest.mark.parametrize("verb", ["greet", "stress"])
 def test_runs_of_a_verb_that_does_not_train_are_no_grid(capsys, verb):
-    """They were read as runs of ``ghgs train``, which has other keys."""
+    """Regression: they were read as runs of ``ghgs train``, which has other keys."""
     name = ["name=Ada,Bob"] if verb == "greet" else ["quick=true,false"]
     assert ghgs(verb, "-m", *name, "hydra/sweeper=grid", "hydra.sweep.dir=sweep") == 1
     expected = f"expected basic for ghgs {verb}, which is not derived from ghgs train; found 'grid'"
@@ -100,7 +100,7 @@ class Distil(Train):
 
 
 def test_runs_of_a_verb_derived_from_training_are_planned_with_its_own_keys(tmp_path, capsys):
-    """They were read as runs of ``ghgs train``, which lacks these."""
+    """Regression: they were read as runs of ``ghgs train``, which lacks these keys."""
     (tmp_path / "own_verb.py").write_text(TRAINING)
     (tmp_path / "conf").mkdir()
     own = "defaults: [train, _self_]\nhydra: {job: {name: distil}}\n"

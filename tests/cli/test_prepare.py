@@ -1,4 +1,4 @@
-"""``ghgs prepare`` on data that is incomplete on purpose."""
+"""``ghgs prepare`` on intentionally incomplete data."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A dry run reports all that is missing at once."""
+"""A dry run reports everything that is missing at once."""
 
 import re
 import shutil
@@ -34,7 +34,7 @@ def rehearsed(*overrides):
 
 
 def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
-    """Each was found by another run, hours after the plan was green."""
+    """Regression: each problem was found by another run, hours after the plan had passed."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setitem(sys.modules, "torchvision", None)
     monkeypatch.setitem(sys.modules, "wandb", None)
@@ -85,7 +85,7 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
 
 
 def test_weights_of_another_size_are_a_note(tmp_path, rendered):
-    """A training begins with what fits, which may be next to nothing."""
+    """Training starts from the tensors that fit, which may be almost none."""
     small = ["encoder.vit.channels=8", "recalibration.k=8", "recalibration.num_heads=2"]
     path = tmp_path / "small.ckpt"
     model = GHGS.from_config(run_of("train", [*SMALL, *small]).plain)
@@ -99,8 +99,8 @@ def test_weights_of_another_size_are_a_note(tmp_path, rendered):
 
 
 def test_the_room_for_tokens_is_said(rendered):
-    """Before anything is written: three people in 16 positions, 2 x 2 patches,
-    32 channels of two bytes."""
+    """Reported before anything is written: three people in 16 positions, 2 x 2 patches, 32 channels of
+    two bytes."""
     encoder = "encoder={width: 32, heads: 2, depth: 4, layers: [0, 1, 2, 3], image_size: 28}"
     frozen = ["encoder=vggt_1b", encoder, "encoder.vit={depth: 2, heads: 2}", "allow_random_encoder=true"]
     found = rehearsed(
@@ -127,11 +127,11 @@ def test_the_room_for_tokens_is_said(rendered):
     ],
 )  # fmt: skip
 def test_files_that_a_later_step_would_read_are_named(tmp_path, rendered, lacking, said):
-    """A run found them after hours: the first batch is of somebody else."""
+    """Regression: a run found them after hours, because the first batch has another subject."""
     root = tmp_path / "some"
     shutil.copytree(rendered, root)
     names = sorted({path.name.rpartition("_")[0] for path in (root / "train" / "img").iterdir()})
-    for name in names:  # every one has a body
+    for name in names:  # each one has a body
         folder = root / "train" / "smpl" / name
         folder.mkdir(parents=True, exist_ok=True)
         np.save(folder / "vertices.npy", np.random.default_rng(0).normal(size=(9, 3)) * 0.2)
@@ -159,7 +159,7 @@ def test_nothing_is_missing_and_nothing_is_written(monkeypatch, capsys, tmp_path
 
 
 def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, tmp_path):
-    """A plan that was green started jobs that failed; each reason is said once."""
+    """Regression: a plan that had passed started jobs that failed. Each reason is reported once."""
     command = ["-m", *SMALL, f"data.root={tmp_path / 'none'}", "seed=1,2", "ablation=full,neither"]
     command += ["dry_run=true", "encoder.layers=[1,2,3]", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     code, out, err = call(monkeypatch, capsys, "train", *command)
@@ -170,7 +170,7 @@ def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, 
 
 
 def test_people_that_are_not_rendered_are_not_rendered_by_a_plan(tmp_path):
-    """They take minutes."""
+    """Rendering takes minutes."""
     found = rehearsal.rehearse([run_of("train", [f"data.cache_dir={tmp_path}", "loss=depth"])])
     assert found.reasons == []
     assert any("people are rendered before the first step" in note for note in found.notes)

@@ -1,4 +1,4 @@
-"""How commands begin and end: what they do not wait for, and what still happens when they exit."""
+"""Start and end of commands: imports that they avoid, and what still happens at exit."""
 
 import gc
 import os
@@ -38,7 +38,7 @@ print("\\n", code, *sys.modules)
     ],
 )
 def test_help_and_wrong_paths_do_not_wait_for_pytorch(tmp_path, arguments, code, absent):
-    """Its import takes a second or more."""
+    """Importing PyTorch takes a second or more."""
     arguments = [*arguments, f"hydra.run.dir={tmp_path}/run"] if code else arguments
     done = run_python(_COMMAND.format(arguments=arguments))
     found, *loaded = done.stdout.splitlines()[-1].split()
@@ -49,7 +49,7 @@ def test_help_and_wrong_paths_do_not_wait_for_pytorch(tmp_path, arguments, code,
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_is_stopped_while_it_starts_says_so(monkeypatch, capsys, number):
-    """Ctrl-C in the seconds of imports ended in a traceback, or in what the library made of it."""
+    """Regression: Ctrl-C during imports ended in a traceback or in an error of the library."""
 
     def interrupted():
         try:
@@ -94,7 +94,7 @@ sys.exit(main())
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_command_ends_as_python_does(tmp_path, fails):
-    """Hooks run, output is flushed, what a run leaves is collected."""
+    """Exit hooks run, output is flushed, and the remains of a run are collected."""
     code = _ENDING.format(verb="table", override="runs=x", fails=fails, folder=tmp_path)
     done = run_python(code, expected=int(fails))
     assert done.stdout == "said hook\n"
@@ -102,7 +102,7 @@ def test_a_command_ends_as_python_does(tmp_path, fails):
 
 
 def test_files_that_a_plug_in_leaves_open_are_whole(tmp_path):
-    """Frozen objects are not, where they belong to a cycle; a module and its functions do."""
+    """Frozen objects in a cycle are not flushed; a module and its functions form one."""
     plugin, path = tmp_path / "my_unprojection.py", tmp_path / "file.txt"
     plugin.write_text(
         "from ghgs_lit.config import register\n"
@@ -121,10 +121,10 @@ def test_files_that_a_plug_in_leaves_open_are_whole(tmp_path):
 
 
 def test_garbage_is_collected_after_a_command(monkeypatch, capsys):
-    """Also in a process that goes on."""
+    """Also in a process that continues."""
     monkeypatch.setattr(sys, "argv", ["ghgs", "--help"])
     assert main() == 0
     frozen = gc.get_freeze_count()
     assert main() == 0
     assert gc.isenabled()
-    assert gc.get_freeze_count() <= frozen  # what is frozen may be freed, but nothing is added
+    assert gc.get_freeze_count() <= frozen  # frozen objects may be freed, but none are added

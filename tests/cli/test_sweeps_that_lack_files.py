@@ -1,6 +1,6 @@
 """Dry runs of the paper's four sweeps on miniatures: complete, and with each file missing in turn.
 
-The answers are listed in ``docs/evidence/broken_files.md``.
+``docs/evidence/broken_files.md`` lists the messages.
 """
 
 import os
@@ -29,7 +29,7 @@ BODY = r"expected body vertices for loss\.weights\.chamfer=1\.0 \(0 does without
 FILE = r"expected a file of the data set; found none"
 FOLDER = r"expected the folder of the data set; found no such folder"
 
-# What is deleted; the sweep and its other words; lines that answer.
+# Deleted files; the sweep and its other overrides; expected messages.
 CASES = {
     # ZJU-MoCap and HuMMan: table 1
     "photograph": ("zju_mocap/*386/Camera_B3/*", "table1", [rf"386/Camera_B3/000000\.jpg: {FILE}"]),
@@ -64,7 +64,7 @@ CASES = {
         "table3",
         [rf"mask/.*: {FILE}", rf"intrinsic\.npy: {FILE}", rf"extrinsic\.npy: {FILE}", BODY],
     ),
-    # What is no data
+    # Other than data
     "weights": ("vggt.ckpt", "table2", [r"vggt\.ckpt: expected a file of weights; found none"]),
     "weights and data": ("[tv]*", "table4", [r"vggt\.ckpt: expected", rf"thuman2: {FOLDER}"]),
     "import": ("", "table3 init_from=null", [r"init_from: expected a checkpoint with the encoder's weights"]),
@@ -107,7 +107,7 @@ def dry_run(monkeypatch, capsys, tmp_path, whole):
         sweep, *changes = words.split()
         there = {path.relative_to(tmp_path) for path in tmp_path.rglob("*")}
         answer = call(monkeypatch, capsys, "train", f"sweep={sweep}", *SMALL, *COMMAND, *changes)
-        assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*")} == there  # nothing has begun
+        assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*")} == there  # nothing was written
         return answer
 
     return run
@@ -115,19 +115,19 @@ def dry_run(monkeypatch, capsys, tmp_path, whole):
 
 @pytest.mark.parametrize("sweep", ["table1", "table2", "table3", "table4"])
 def test_a_sweep_whose_files_are_there_is_planned(dry_run, sweep):
-    """The runs, and no more than warnings of the readers."""
+    """The plan is printed, with warnings of the readers at most."""
     code, out, err = dry_run("", sweep)
     assert code == 0, err
     assert "would be refused" not in out
     warnings = re.findall(r"(\w+: \d+) of \d+ sequences of (train|val) are there", out + err)
-    # The miniatures have one sequence of each phase; HuMMan's training takes what is there.
+    # The miniatures have one sequence per phase; HuMMan's training uses all that exist.
     few = {("zju_mocap: 1", "train"), ("zju_mocap: 1", "val"), ("humman: 1", "val")}
     assert set(warnings) == (few if sweep == "table1" else set())
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_each_file_that_lacks_is_one_line_before_training(dry_run, case):
-    """Path, expected, found; all of them at once; exit code 1; nothing is written, no traceback."""
+    """Path, expected and found, for all files at once; exit code 1, nothing written, no traceback."""
     deleted, words, expected = CASES[case]
     code, out, err = dry_run(deleted, words)
     refused = re.findall(r"^would be refused: (.*)$", out, re.MULTILINE)
@@ -140,6 +140,6 @@ def test_each_file_that_lacks_is_one_line_before_training(dry_run, case):
 
 
 def test_depth_maps_are_not_needed(dry_run):
-    """The paper's loss reads none; the depth error of the tables is left out."""
+    """The paper's loss reads no depth maps; the depth error in tables is omitted."""
     code, out, _ = dry_run("thuman2/*/depth", "table3")
     assert code == 0, out

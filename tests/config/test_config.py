@@ -1,4 +1,4 @@
-"""Every YAML that ships composes; everything with a kind in it can be built."""
+"""Every shipped YAML file composes, and every node with a kind can be built."""
 
 import functools
 import importlib.util
@@ -21,12 +21,12 @@ from tests.helpers.jobs import rehearse_nothing
 
 CONF = conf_dir()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
-#: Packages that an option needs, and the extra that has them.
+#: Packages that an option requires, and the extra that installs them.
 NEEDS = {"logger.wandb": ("wandb", "wandb"), "metrics=release": ("torchvision", "lpips")}
 
 
 def nodes_with_kind(node, key=""):
-    """The outermost nodes that describe an object."""
+    """Outermost nodes that describe an object, with their keys."""
     if OmegaConf.is_dict(node):
         if "kind" in node and key != "targets":
             yield key, node
@@ -46,15 +46,14 @@ def test_every_verb_composes():
 
 @functools.cache
 def parameters_of(stages):
-    """The number of parameters of the model of ``stages`` (YAML), built once."""
+    """Number of parameters of the model of ``stages`` (YAML), built once."""
     with torch.device("meta"):
         return sum(p.numel() for p in GHGS.from_config(OmegaConf.create(stages)).parameters())
 
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_member_composes_and_its_model_is_built(group):
-    """A shipped option that does not compose, or builds no model,
-    would fail only for its first user."""
+    """A shipped option that does not compose or builds no model would fail only for its first user."""
     for path in sorted((CONF / group).glob("*.yaml")):
         cfg = composed("train", f"{group}={path.stem}")
         nodes = {*STAGES, *OPTIONS, "rounds", "compat"}
@@ -75,7 +74,7 @@ def test_every_object_outside_the_model_is_built(group, tmp_path):
             "logger": {"save_dir": str(tmp_path)},
         }.get(group, {})
         for key, part in nodes_with_kind(cfg.get(group), group):
-            if group == "trainer":  # one for a GPU refuses to be made where there is none
+            if group == "trainer":  # a Trainer for a GPU requires one
                 part = {**part, "accelerator": "cpu"}
             lacking = NEEDS.get(key if group == "logger" else f"{group}={path.stem}")
             if lacking and importlib.util.find_spec(lacking[0]) is None:
@@ -87,7 +86,7 @@ def test_every_object_outside_the_model_is_built(group, tmp_path):
 
 @pytest.mark.parametrize("ablation", ["full", "no_unprojection", "no_semantic", "neither"])
 def test_the_papers_ablation_composes(ablation):
-    """The rows that tables read from the model must be those of the option's name."""
+    """Table rows, which are derived from the model, must match the option's name."""
     cfg = composed("train", f"ablation={ablation}", "model=paper")
     assert switches_of(cfg) == (ablation in ("full", "no_semantic"), ablation in ("full", "no_unprojection"))
     assert ablation_of(cfg) == ablation
@@ -112,8 +111,8 @@ views: {training: uneven}
 
 @pytest.fixture
 def own(monkeypatch, tmp_path):
-    """``own(ablation=text)`` writes the file ``mine`` of a group;
-    returns the flags that show its folder."""
+    """``own(ablation=text)`` writes the option ``mine`` of a group and returns the flags that select its
+    folder."""
 
     rehearse_nothing(monkeypatch)
 
@@ -127,8 +126,8 @@ def own(monkeypatch, tmp_path):
 
 
 def test_what_an_ablation_sets_holds(monkeypatch, capsys, own):
-    """Loss, optimizer and views composed after it,
-    so that its keys had no effect and two rows were one."""
+    """Regression: loss, optimizer and views composed after the ablation, so its keys had no effect and
+    two rows were equal."""
     flags = own(ablation=SETS)
     said = ["experiment=demo", "ablation=mine", "views.training=any"]
     code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", *flags, *said)
@@ -142,7 +141,7 @@ def test_what_an_ablation_sets_holds(monkeypatch, capsys, own):
 
 
 def test_combinations_that_are_one_configuration_are_counted(monkeypatch, capsys, own):
-    """A 2 x 2 grid became two runs without a word."""
+    """Regression: a 2 x 2 grid became two runs without a message."""
     flags = own(ablation=SETS)
     grid = ["ablation=full,mine", "seed=1,2", "loss.weights.render_l1=1", "optimizer=release"]
     grid += ["optimizer.lr=1e-5", "views.training=uneven"]
@@ -172,7 +171,7 @@ def test_combinations_that_are_one_configuration_are_counted(monkeypatch, capsys
 def test_a_key_of_an_ablation_that_does_not_hold_is_refused(
     monkeypatch, capsys, tmp_path, own, files, message, mode
 ):
-    """An empty mapping is merged, and keys without the header are below ``ablation``."""
+    """An empty mapping is merged, and keys without the header end up below ``ablation``."""
     flags = own(**files)
     flags += ["-m"] if mode == "-m" else [f"hydra.run.dir={tmp_path / 'run'}"]
     chosen = "experiment=mine" if "experiment" in files else "ablation=mine"
@@ -183,7 +182,7 @@ def test_a_key_of_an_ablation_that_does_not_hold_is_refused(
 
 
 def test_a_primary_configuration_of_ones_own_does_not_hide_an_ablation(monkeypatch, capsys, tmp_path, own):
-    """Its keys compose after everything in its defaults."""
+    """Keys of a primary configuration compose after everything in its defaults."""
     flags = own(ablation=SETS)
     (tmp_path / "primary.yaml").write_text("defaults: [train, _self_]\noptimizer: {lr: 0.5}\n")
     flags += ["--config-name", "primary", "ablation=mine", f"hydra.run.dir={tmp_path / 'run'}"]
@@ -193,15 +192,15 @@ def test_a_primary_configuration_of_ones_own_does_not_hide_an_ablation(monkeypat
 
 
 def test_a_model_may_set_keys_of_loss_and_optimizer(monkeypatch, capsys, own):
-    """As ``model=recurrent`` does; they composed after it."""
+    """As ``model=recurrent`` does. Regression: these groups composed after the model."""
     flags = own(model="# @package _global_\ndefaults: [hull, _self_]\noptimizer: {lr: 0.25}\n")
     _, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", *flags, "model=mine")
     assert OmegaConf.create(out).optimizer.lr == 0.25
 
 
 def test_options_are_read_inside_another_hydra_application(tmp_path):
-    """Its search path has none of the package's files:
-    ``targets: expected one of ; found 'midway'``."""
+    """Regression: its search path lacks the package's files: ``targets: expected one of ; found
+    'midway'``."""
     (tmp_path / "theirs.yaml").write_text("lr: 1\n")
     with initialize_config_dir(str(tmp_path), **VERSION_BASE):
         their = hydra.compose("theirs")

@@ -1,4 +1,4 @@
-"""YAML says what differs from the defaults of classes; composed configurations say all."""
+"""YAML files contain only differences from the defaults of classes; composed configurations are complete."""
 
 import json
 
@@ -30,8 +30,8 @@ class Outer(Options):
 
 
 def test_what_is_not_said_is_the_default():
-    """A part of an inner mapping is over the default of its field;
-    other mappings are whole values."""
+    """A partial inner mapping is merged over the default of its field; other mappings are complete
+    values."""
     full = with_defaults({"inner": {"sizes": [3]}, "maybe": {}, "shares": {"b": 1.0}, "new": 1}, Outer)
     inner = {"width": 8, "sizes": [3]}
     nested = {"inner": inner, "maybe": {"width": 4, "sizes": [1, 2]}, "shares": {"b": 1.0}}
@@ -48,12 +48,12 @@ def restated(values, defaults, path):
 
 @pytest.mark.parametrize("group", sorted(KINDS.keys() - {"model", "compat", "rounds"}))
 def test_no_option_restates_a_default(group):
-    """Two places that say the same would one day say two things; others refer to few."""
+    """Values stated twice would diverge some day; the exceptions are referred to by other keys."""
     wrong = []
     for path in sorted((conf_dir() / group).glob("*.yaml")):
         content = yaml.safe_load(path.read_text()) or {}
         bases = [name for name in content.pop("defaults", []) if isinstance(name, str) and name != "_self_"]
-        if bases:  # an option that changes another one may set a key back
+        if bases:  # an option derived from another one may reset a key
             continue
         for key, node in nodes_of({group: content}):
             if "kind" in node or None in KINDS[group]:
@@ -71,7 +71,7 @@ def test_no_verb_restates_a_default(verb):
 
 @pytest.mark.parametrize("group", sorted(KINDS))
 def test_a_composed_configuration_has_every_key(group):
-    """Runs save it: defaults of classes may change, what a run used may not."""
+    """Runs save it: defaults of classes may change, but not the values that a run used."""
     cfg = composed("train", "model=recurrent") if group == "rounds" else composed(verb_with(group))
     for key, node in nodes_of(OmegaConf.to_container(cfg, resolve=True)):
         if key.split(".")[0] == group:
@@ -89,7 +89,7 @@ def test_a_composed_configuration_has_every_key(group):
         ("gaussian_head.attributes.inward=0.25", "gaussian_head.attributes.inward", 0.25),
         ("optimizer.freeze_until.encoder=0.5", "optimizer.freeze_until.encoder", 0.5),
         ("callbacks.pictures.subjects=2", "callbacks.pictures.subjects", 2),
-        # a key that no file says
+        # a key that no file sets
         ("trainer.profiler=${data.resampling}", "trainer.profiler", "area"),
     ],
 )
@@ -99,7 +99,7 @@ def test_a_key_that_no_file_says_can_be_set(override, key, value):
 
 
 def test_an_inner_key_leaves_the_others_at_the_default_of_their_field():
-    """Scans are rendered without lights; they had the lights of built-in people."""
+    """Regression: scans, which are rendered without lights, had the lights of built-in people."""
     data = run_of("prepare", ["data=scans", "data.render.quality=90"]).plain["data"]
     assert (data["render"]["lights"], data["render"]["quality"]) == ("none", 90)
 

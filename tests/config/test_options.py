@@ -1,4 +1,4 @@
-"""YAML and options say the same: no key without a field, no field that no shipped file sets."""
+"""YAML files and options agree: no key without a field, no field that no shipped file sets."""
 
 import functools
 import re
@@ -21,7 +21,7 @@ TYPED = [(group, kind) for group, kinds in KINDS.items() for kind in kinds]
 
 @functools.cache
 def shipped(group):
-    """The nodes of a group in everything that ships, as plain data."""
+    """Nodes of a group in all shipped configurations, as plain data."""
     files = sorted((conf_dir() / group).glob("*.yaml"))
     configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
     configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent", "pixel")]
@@ -41,7 +41,7 @@ def shipped(group):
 
 def fields(cls, prefix=""):
     for name, field in cls.model_fields.items():
-        # Of lists of options files have whole values.
+        # Files set lists of options as whole values.
         nested = None if get_origin(field.annotation) is tuple else options_of(field.annotation)
         yield f"{prefix}{name}"
         if nested is not None:
@@ -67,7 +67,7 @@ def nested_classes(cls):
 
 
 def test_every_field_has_a_meaning():
-    """``ghgs <verb> --help`` and ``ghgs <verb> --help <group>`` show it."""
+    """Printed by ``ghgs <verb> --help`` and ``ghgs <verb> --help <group>``."""
     for cls in [class_of(group, kind, group) for group, kind in TYPED] + [
         verb_class(verb) for verb in verbs()
     ]:
@@ -75,13 +75,13 @@ def test_every_field_has_a_meaning():
             assert set(each.model_fields) <= set(meanings(each)), each
 
 
-#: Keys that must be given.
+#: Required keys.
 GIVEN = {"export": ["checkpoint=a.ckpt"], "import": ["out=b.ckpt"], "table": ["runs=c"]}
 
 
 @pytest.mark.parametrize("verb", verbs())
 def test_yaml_and_options_of_a_verb_agree(verb):
-    """A default in two places that differ would be wrong in one of them."""
+    """A default that differs in two places would be wrong in one of them."""
     given = GIVEN.get(verb, [])
     read = run_of(verb, given)
     options = verb_class(verb)
@@ -91,7 +91,7 @@ def test_yaml_and_options_of_a_verb_agree(verb):
             assert getattr(read, name) == field.get_default(call_default_factory=True), name
 
 
-#: Integers that need no limit, by the reason: no value hangs or takes all memory.
+#: Integers that need no limit, by reason: no value hangs or exhausts memory.
 UNLIMITED = {
     "there are no more": """
         subjects subject limit.train limit.val pictures k tolerance chamfer_points limit_val_batches
@@ -108,7 +108,7 @@ UNLIMITED = {
 
 
 def numbers(cls, prefix=""):
-    """Keys and descriptions of the fields of a class with an integer that has no upper limit."""
+    """Keys of a class's fields with an integer that has no upper limit."""
     for name, field in cls.model_fields.items():
         if (nested := options_of(field.annotation)) is not None:
             yield from numbers(nested, f"{prefix}{name}.")
@@ -117,7 +117,7 @@ def numbers(cls, prefix=""):
 
 
 def test_every_number_has_a_limit_or_can_do_no_harm():
-    """``skip.margin=1000000000`` and ``rounds.count=1000000000`` ran until somebody killed them."""
+    """Regression: ``skip.margin=1000000000`` and ``rounds.count=1000000000`` ran until they were killed."""
     classes = [class_of(group, kind, group) for group, kind in TYPED] + [verb_class(verb) for verb in verbs()]
     found = {key for cls in classes for key in numbers(cls)}
     harmless = {name for names in UNLIMITED.values() for name in names.split()}
@@ -127,19 +127,19 @@ def test_every_number_has_a_limit_or_can_do_no_harm():
 
 @pytest.fixture(scope="module")
 def whole():
-    """A configuration of every group."""
+    """A configuration with every group."""
     cfg = composed("train", "model=recurrent", "logger=wandb")
     return OmegaConf.to_container(cfg, resolve=True)
 
 
 def with_value(config, key, value):
-    """``config`` with another value of a dotted key; the nodes on the way are copied."""
+    """``config`` with another value at a dotted key; nodes along the path are copied."""
     name, _, rest = key.partition(".")
     return {**config, name: with_value(config[name], rest, value) if rest else value}
 
 
 def message(verb, config):
-    """What is wrong with a configuration; none: nothing."""
+    """Error message for a configuration; None if it is valid."""
     try:
         verb_class(verb).of(config)
     except InputError as error:
@@ -147,8 +147,8 @@ def message(verb, config):
 
 
 def test_wrong_values_are_named_with_what_was_expected_and_found():
-    """Wrong types and ranges ended in tracebacks, comparisons of texts with numbers,
-    or ran for ever."""
+    """Regression: wrong types and ranges ended in tracebacks, comparisons of texts with numbers, or
+    endless runs."""
     wrong = []
     for line in Path(__file__).with_name("wrong_values.txt").read_text().splitlines():
         command, _, words = line.partition(": ")
@@ -165,7 +165,7 @@ def test_wrong_values_are_named_with_what_was_expected_and_found():
 
 
 def test_what_the_documentation_allows_passes(whole):
-    """Options must not forbid values that work."""
+    """Options must not reject values that work."""
     for key, value in (
         ("optimizer.lr", 1),
         ("trainer.max_time", {"hours": 2}),
@@ -182,7 +182,7 @@ def test_what_the_documentation_allows_passes(whole):
 
 
 def test_an_unknown_key_is_refused_in_every_group(whole):
-    """A misspelt key that is ignored would be a setting that does nothing."""
+    """A misspelt key that is ignored would be a setting without effect."""
     for group in KINDS:
         verb = verb_with(group)
         config = whole if verb == "train" else OmegaConf.to_container(composed(verb), resolve=True)

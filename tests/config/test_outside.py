@@ -1,5 +1,4 @@
-"""Files of ``--config-dir`` say to Hydra only what a list allows;
-the rest is the command line's."""
+"""Files of ``--config-dir`` may set only listed keys of Hydra; the command line may set all."""
 
 import os
 
@@ -11,7 +10,7 @@ from tests.helpers.jobs import rehearse_nothing
 
 GLOBAL = "# @package _global_\n"
 REFERENCES = "expected no interpolations but references to keys; found "
-#: Hydra's own words that call, by the file that says them: {file: text}, and what is named.
+#: Rejected uses of Hydra by case: {file: text}, and the expected part of the message.
 REFUSED = {
     "environment": ({"experiment/x": GLOBAL + "hydra: {job: {env_set: {A: b}}}"}, "hydra.job.env_set.A='b'"),
     "callbacks": (
@@ -120,10 +119,11 @@ def written(folder, files):
     [*((case, "single") for case in REFUSED), ("environment", "grid"), ("a group of Hydra", "grid")],
 )
 def test_what_a_file_says_to_hydra_is_held_to_a_list(monkeypatch, capsys, tmp_path, case, mode):
-    """``env_set: {GHGS_PLUGINS: ...}`` of a file ran its code, and callbacks called functions."""
+    """Regression: ``env_set: {GHGS_PLUGINS: ...}`` in a file executed its code, and callbacks called
+    functions."""
     files, message = REFUSED[case]
     flags = [*written(tmp_path, files), f"hydra.run.dir={tmp_path / 'run'}"]
-    # A file that only the second job chooses is read when the grid is planned.
+    # A file chosen only by the second job is read when the grid is planned.
     grid = ["-m", "experiment=demo,x", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     chosen = ["experiment=x"] if mode == "single" else grid
     before = dict(os.environ)
@@ -137,7 +137,7 @@ def test_what_a_file_says_to_hydra_is_held_to_a_list(monkeypatch, capsys, tmp_pa
 
 
 def test_a_file_may_say_where_what_and_how_many(monkeypatch, capsys, tmp_path):
-    """Sweeps and launchers of one's own must not need the command line."""
+    """User-defined sweeps and launchers must work without command-line overrides."""
     sweep = """hydra:
   mode: MULTIRUN
   sweep: {dir: FOLDER/sweep}
@@ -158,7 +158,7 @@ def test_a_file_may_say_where_what_and_how_many(monkeypatch, capsys, tmp_path):
 
 
 def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_path):
-    """``hydra.searchpath`` and ``--config-path`` are other ways to the same files."""
+    """``hydra.searchpath`` and ``--config-path`` reach the same files in other ways."""
     files, message = REFUSED["environment"]
     folder = written(tmp_path, files)[1]
     flags = [f"hydra.searchpath=[{folder}]", f"hydra.run.dir={tmp_path / 'run'}"]
@@ -187,7 +187,7 @@ def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_p
     ],
 )
 def test_a_file_that_is_no_plain_yaml_is_refused(monkeypatch, capsys, tmp_path, text, message):
-    """References of YAML to themselves, some hundred bytes that are a billion values, other encodings."""
+    """Aliases in a loop, a few hundred bytes that expand to a billion values, and other encodings."""
     flags = written(tmp_path, {"experiment/x": GLOBAL})
     with open(tmp_path / "conf" / "experiment" / "x.yaml", "ab") as file:
         file.write(text if isinstance(text, bytes) else text.encode())
@@ -200,7 +200,7 @@ def test_a_file_that_is_no_plain_yaml_is_refused(monkeypatch, capsys, tmp_path, 
 
 
 def test_a_byte_order_mark_is_no_part_of_a_file(monkeypatch, capsys, tmp_path):
-    """Windows' editors write one, before the line ``@package`` too."""
+    """Editors on Windows write one, also before the ``@package`` line."""
     flags = written(tmp_path, {"experiment/x": "\ufeff" + GLOBAL + "seed: 7"})
     code, out, _ = call(monkeypatch, capsys, "train", *flags, "experiment=x", "--cfg", "job")
     assert (code, OmegaConf.create(out).seed) == (0, 7)

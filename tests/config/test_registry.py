@@ -1,4 +1,4 @@
-"""A configuration names kinds of options; nothing that it says imports or calls code."""
+"""A configuration names kinds of options; no value in it imports or calls code."""
 
 import contextlib
 import importlib
@@ -21,7 +21,7 @@ from tests.helpers.weights import config
 
 
 def everything_callable():
-    """Paths of all functions and classes that the package defines."""
+    """Import paths of all functions and classes that the package defines."""
     packages = (ghgs_lit, ghgs_people, ghgs_capture)
     for info in chain.from_iterable(pkgutil.walk_packages(p.__path__, f"{p.__name__}.") for p in packages):
         if info.name.endswith("__main__"):
@@ -37,7 +37,7 @@ def everything_callable():
 
 EXTRA = {"data": {"views": {}, "targets": {"name": "cameras"}}, "logger": {"save_dir": "."}}
 
-#: What nodes without kinds must have.
+#: Required keys of nodes without kinds.
 NAMES = {"views": {}, "targets": {"name": "release"}}
 
 
@@ -49,11 +49,11 @@ OUTSIDE = ["os.system", "subprocess.run", "builtins.eval", "torch.load", "lightn
 
 
 def test_no_function_or_class_is_a_kind_by_its_path():
-    """A checkpoint said ``_target_: ghgs_lit.runs.job._run_process`` with a command,
-    and the command ran."""
+    """Regression: ``_target_: ghgs_lit.runs.job._run_process`` with a command in a checkpoint executed
+    the command."""
     paths = [*everything_callable(), *OUTSIDE]
     assert len(paths) > 1500
-    for number, path in enumerate(paths):  # of each group a share, and what is not ours
+    for number, path in enumerate(paths):  # a share for each group, foreign paths for all
         for group in list(KINDS) if path in OUTSIDE else list(KINDS)[number % len(KINDS) :: len(KINDS)]:
             with pytest.raises(InputError, match=rf"{group}.*(kind|expected one of)"):
                 build({**NAMES.get(group, {}), "kind": path}, key_of(group))
@@ -61,7 +61,7 @@ def test_no_function_or_class_is_a_kind_by_its_path():
 
 @pytest.mark.parametrize("group", sorted(KINDS))
 def test_keys_of_hydras_instantiate_have_no_effect(group, tmp_path):
-    """At every node, and nested; what a file says is data."""
+    """At every node and nested: values in a file are data."""
     verb = verb_with(group)
     node = composed(verb, *["model=recurrent", "logger=wandb"] * (verb == "train")).get(group)
     if group in NAMED:
@@ -74,14 +74,14 @@ def test_keys_of_hydras_instantiate_have_no_effect(group, tmp_path):
     for name in node:
         if name == "kind":
             continue
-        with contextlib.suppress(Exception):  # whatever it answers
+        with contextlib.suppress(Exception):  # whatever the result
             build({**dict(node), name: call}, key_of(group), **EXTRA.get(group, {}))
     assert not (tmp_path / "called").exists()
 
 
 @pytest.mark.parametrize("stage", ["bounds", "encoder", "depth_head", "recalibration", "gaussian_head"])
 def test_a_model_is_built_of_kinds_alone(stage):
-    """The same for the nodes of a checkpoint."""
+    """The same holds for the nodes of a checkpoint."""
     settings = config()
     settings[stage] = {"_target_": "ghgs_lit.runs.job._run_process", "command": ["false"]}
     with pytest.raises(InputError, match=rf"{stage}\.kind: expected"):
@@ -89,14 +89,14 @@ def test_a_model_is_built_of_kinds_alone(stage):
 
 
 def test_every_kind_exists():
-    """A path in the table that is wrong would fail for its first user."""
+    """A wrong path in the table would fail for its first user."""
     for group, kinds in KINDS.items():
         for kind in kinds:
             assert inspect.isclass(class_of(group, kind, group))
 
 
 def test_kinds_of_the_users_own(monkeypatch):
-    """A registered kind is read and built like those of the package, and hides none of them."""
+    """A registered kind is read and built like those of the package, and replaces none of them."""
     monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
 
     @register("bounds", "sphere")
@@ -122,7 +122,7 @@ def test_kinds_of_the_users_own(monkeypatch):
 
 
 def test_a_file_of_a_subpackage_registers_its_kinds(monkeypatch, tmp_path):
-    """Another depth head is one file beside the others: no list names it."""
+    """Another depth head is one file next to the others; no list contains it."""
     (tmp_path / "flat.py").write_text(
         "from ghgs_lit.config import register\n"
         "from ghgs_lit.config.options import Options\n\n\n"

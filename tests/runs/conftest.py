@@ -1,4 +1,4 @@
-"""Sweeps without trainings."""
+"""Fixtures for sweeps that do not train."""
 
 import pytest
 
@@ -14,7 +14,7 @@ def plans_alone(monkeypatch):
 
 @pytest.fixture
 def sweep(monkeypatch, capsys, tmp_path):
-    """``sweep("seed=1,2")`` runs the verb as a sweep in ``tmp_path / "sweep"`` without training."""
+    """``sweep("seed=1,2")`` runs ``ghgs train`` as a sweep in ``tmp_path / "sweep"`` without training."""
     monkeypatch.setattr(train_verb, "train", record_execution)
 
     def run(*overrides: str):

@@ -1,5 +1,5 @@
-"""A directory is that of one configuration: what goes on in it, what is refused,
-and what may be deleted."""
+"""A directory belongs to one configuration: what resumes in it, what is rejected, and what may be
+deleted."""
 
 import json
 import os
@@ -29,7 +29,7 @@ class Killed(BaseException):
 
 
 def train_to(checkpoint: bool, seen: list):
-    """A training that is killed, after its first checkpoint or before."""
+    """Training function that is killed before or after its first checkpoint."""
 
     def train(run, directory, stats):
         seen.append(run.resume)
@@ -42,7 +42,7 @@ def train_to(checkpoint: bool, seen: list):
 
 
 def killed(path, run=RUN, checkpoint=True) -> list:
-    """Train in a directory until a kill; the checkpoint that was resumed."""
+    """Train in a directory until the process is killed; returns the checkpoints it resumed from."""
     seen = []
     with pytest.raises(Killed):
         job.train_once(RunDirectory(path), run, train_to(checkpoint, seen))
@@ -54,8 +54,7 @@ def finished(path, run=RUN) -> float:
 
 
 def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
-    """A batch system that queues a job again runs its command again: nothing is refused,
-    nothing is lost."""
+    """A batch system that requeues a job repeats its command: nothing is rejected and nothing is lost."""
     path = tmp_path / "run"
     last = str(path / "checkpoints" / "last.ckpt")
     assert killed(path, checkpoint=False) == [None]
@@ -69,15 +68,15 @@ def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
         *["checkpoints/last.ckpt"] * 2,
     ]
     assert "done before" not in capsys.readouterr().out
-    assert finished(path) == 20.5  # and is not trained again
+    assert finished(path) == 20.5  # not trained again
     assert f"done before: {path}" in capsys.readouterr().out
     assert len(RunDirectory(path).sessions()) == 4
     assert RunDirectory(path).marker == identity
 
 
 def test_what_is_trained_again_leaves_no_logs_of_before(tmp_path):
-    """A kill before the first checkpoint left event files,
-    beside which the same steps stood again."""
+    """Regression: a kill before the first checkpoint left event files, so that the same steps were logged
+    twice."""
     killed(tmp_path / "run", checkpoint=False)
     (tmp_path / "run" / EVENTS).rename(tmp_path / "run" / f"{EVENTS}.x")
     killed(tmp_path / "run", checkpoint=False)
@@ -85,7 +84,7 @@ def test_what_is_trained_again_leaves_no_logs_of_before(tmp_path):
 
 
 def test_a_moved_run_goes_on(tmp_path):
-    """No file of a run names its directory."""
+    """No file of a run contains the path of its directory."""
     killed(tmp_path / "run")
     shutil.move(tmp_path / "run", tmp_path / "moved")
     assert killed(tmp_path / "moved") == [str(tmp_path / "moved" / "checkpoints" / "last.ckpt")]
@@ -97,7 +96,7 @@ def test_a_moved_run_goes_on(tmp_path):
 
 @pytest.mark.parametrize("is_done", [False, True])
 def test_two_configurations_do_not_share_a_directory(tmp_path, is_done):
-    """The second was "done before", and never trained."""
+    """Regression: the second one was reported as "done before" and never trained."""
     finished(tmp_path / "run") if is_done else killed(tmp_path / "run")
     before = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
     with pytest.raises(
@@ -111,7 +110,7 @@ def test_two_configurations_do_not_share_a_directory(tmp_path, is_done):
 
 
 def test_the_refusal_names_what_differs(verb, tmp_path):
-    """Seconds of reading two configurations are saved."""
+    """The error lists differing keys, so that the user need not compare two configurations."""
     where = f"hydra.run.dir={tmp_path / 'run'}"
     assert verb(where)[0] == 0
     (tmp_path / "run" / "config.yaml").write_text(saved_text(run_of("train", ["resume=null"]).plain))
@@ -122,7 +121,7 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
 
 
 def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
-    """A shorter budget lets a run end; the results of a complete one are not replaced unasked."""
+    """A shorter budget lets a run finish; results of a complete run are not replaced silently."""
     longer = RUN.replace(trainer={**RUN.plain["trainer"], "max_steps": 8})
     killed(tmp_path / "run")
     assert killed(tmp_path / "run", longer) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
@@ -133,7 +132,7 @@ def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
 
 
 def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
-    """``resume=`` is how a finished run is trained on."""
+    """``resume=`` continues the training of a finished run."""
     finished(tmp_path / "run")
     killed(tmp_path / "run", RUN.replace(resume=str(tmp_path / "run" / "checkpoints" / "last.ckpt")))
     best = str(tmp_path / "run" / "checkpoints" / "best.ckpt")
@@ -143,7 +142,8 @@ def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
 
 
 def test_a_run_that_began_elsewhere_goes_on_here(tmp_path):
-    """The same command with a checkpoint of another run must not begin from it a second time."""
+    """Repeating a command that starts from another run's checkpoint resumes instead of starting from it
+    again."""
     other = tmp_path / "other.ckpt"
     other.touch()
     from_other = RUN.replace(resume=str(other))
@@ -161,7 +161,7 @@ def test_a_run_that_began_elsewhere_goes_on_here(tmp_path):
 )
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_files_of_others_are_neither_deleted_nor_mixed_with_a_run(verb, tmp_path, file, overwrite):
-    """``overwrite=true hydra.run.dir=.`` deleted a user's pictures."""
+    """Regression: ``overwrite=true hydra.run.dir=.`` deleted the user's pictures."""
     (tmp_path / file).parent.mkdir(exist_ok=True)
     (tmp_path / file).write_text("mine")
     code, _, err = verb(f"hydra.run.dir={tmp_path}", f"overwrite={overwrite}")
@@ -177,7 +177,7 @@ FOREIGN = ("notes.txt", "tensorboard/notes.txt", "pictures/holiday.png", "checkp
 
 
 def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
-    """Files of the user stay, also in the folders of the run; the run has a new name."""
+    """The user's files remain, also inside the run's folders; the new run has a new ID."""
     path = tmp_path / "run"
     killed(path)
     before = RunDirectory(path).marker.id
@@ -193,7 +193,7 @@ def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
 
 @pytest.mark.parametrize("swept", ['[".."]', '["../.."]', '["."]', '["a/../.."]'])
 def test_a_title_leads_out_of_no_folder(tmp_path, swept):
-    """Overwriting a stranger's run of a sweep emptied the sweep's folder."""
+    """Regression: overwriting an untrusted run of a sweep emptied the sweep's folder."""
     path = tmp_path / "sweep" / "run"
     killed(path)
     for folder in (path.parent, path.parent / "tb"):
@@ -219,7 +219,7 @@ def test_a_damaged_title_is_one_line(verb, tmp_path, text):
 
 @pytest.mark.parametrize("place", ["pictures", "checkpoints", "faults", "../tb", "../tb/seed=2"])
 def test_nothing_is_written_through_links(verb, tmp_path, place):
-    """Pictures went to where the link points."""
+    """Regression: pictures were written to the target of a link."""
     run, outside = tmp_path / "sweep" / "run", tmp_path / "outside"
     outside.mkdir()
     if ".." in place:
@@ -235,7 +235,7 @@ def test_nothing_is_written_through_links(verb, tmp_path, place):
 
 
 def test_overwriting_is_for_the_command_line(verb, tmp_path):
-    """A stranger's file with ``hydra.run.dir`` and ``overwrite`` replaced a run."""
+    """Regression: an external file with ``hydra.run.dir`` and ``overwrite`` replaced a run."""
     killed(tmp_path / "run")
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     own = f"# @package _global_\nhydra: {{run: {{dir: '{tmp_path / 'run'}'}}}}\noverwrite: true\n"
@@ -260,7 +260,7 @@ def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path, key):
 
 
 def test_nothing_is_deleted_without_the_lock(tmp_path):
-    """Two processes that were started together decide one after the other."""
+    """Two processes started at the same time must decide one after the other."""
     killed(tmp_path)
     with pytest.raises(RuntimeError, match="claimed"):
         RunDirectory(tmp_path).begin(RUN.replace(overwrite=True))
@@ -268,7 +268,7 @@ def test_nothing_is_deleted_without_the_lock(tmp_path):
 
 
 def test_a_job_that_is_queued_again_does_not_overwrite_itself(tmp_path, monkeypatch):
-    """Its command has ``overwrite=true`` still."""
+    """The command of a requeued job still contains ``overwrite=true``."""
     run = RUN.replace(overwrite=True)
     monkeypatch.setenv("SLURM_JOB_ID", "77")
     assert killed(tmp_path, run) == [None]
@@ -289,7 +289,7 @@ def test_a_marker_of_another_program_is_refused(tmp_path, text):
 
 
 def test_the_loser_of_two_starts_leaves_the_winner_alone(verb, tmp_path):
-    """It deleted the directory that the winner had begun."""
+    """Regression: the losing process deleted the directory in which the winner had begun."""
     run, ready = tmp_path / "run", PREPARED.Event()
     holder = PREPARED.Process(target=hold_run, args=(run, ready))
     holder.start()
@@ -310,7 +310,7 @@ def test_the_loser_of_two_starts_leaves_the_winner_alone(verb, tmp_path):
 
 @pytest.mark.parametrize("name", ["LOCAL_RANK", "RANK", "SLURM_PROCID"])
 def test_numbers_of_processes_that_were_left_over_do_not_count(verb, tmp_path, monkeypatch, name):
-    """A run was "done" without configuration, sessions or lock."""
+    """Regression: a run was "done" without configuration, sessions or lock."""
     from lightning.pytorch.utilities import rank_zero_only
 
     monkeypatch.setenv(name, "1")
@@ -326,7 +326,7 @@ def test_results_are_those_of_the_configuration(tmp_path):
     assert RunDirectory(tmp_path).of(RUN).metric == 20
     assert RunDirectory(tmp_path).of(RUN.replace(resume=None)).done
     assert not RunDirectory(tmp_path).of(RUN.replace(seed=2)).done
-    # A verb may complete the configuration of its command.
+    # A verb may complete the configuration of its command, whose hash identifies the run.
     content = json.loads((tmp_path / "metrics.json").read_text())
     content["provenance"]["run"] = {"config_hash": config_hash(RUN.replace(seed=2).plain)}
     (tmp_path / "metrics.json").write_text(json.dumps(content))
@@ -334,7 +334,7 @@ def test_results_are_those_of_the_configuration(tmp_path):
 
 
 def test_a_refused_command_changes_no_file_of_the_run(verb, tmp_path):
-    """``.hydra`` said another seed than the run had."""
+    """Regression: ``.hydra`` contained another seed than the run."""
     where = f"hydra.run.dir={tmp_path / 'run'}"
     assert verb(where)[0] == 0
     before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()}

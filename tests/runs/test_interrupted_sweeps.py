@@ -1,4 +1,4 @@
-"""Sweeps that are stopped: what they say, and how they go on."""
+"""Interrupted sweeps: their messages, and how they continue."""
 
 import contextlib
 import itertools
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("plans_alone")
 
 
 def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monkeypatch):
-    """After Ctrl-C the same command must resume from the checkpoint and start failed runs again."""
+    """After Ctrl-C the same command resumes from the checkpoint and restarts failed runs."""
 
     def bad(run, directory, stats):
         if run.seed == 1:
@@ -57,7 +57,7 @@ def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monke
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, number):
-    """Batch systems and ``&&`` read the exit code; the line says how the sweep goes on."""
+    """Batch systems and ``&&`` evaluate the exit code; the message contains the command to continue."""
 
     def stopped(run, directory, stats):
         (directory / "started").touch()
@@ -77,10 +77,10 @@ def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, numbe
 
 
 def stop_in_third_plan(monkeypatch, number, is_lost):
-    """Let a signal arrive while the third configuration of a sweep is looked at.
+    """Send a signal while the third configuration of a sweep is processed.
 
-    OmegaConf restores flags in a ``finally``, where an interruption makes an ``AttributeError``;
-    whoever expects one, as ``hasattr`` does, loses the signal.
+    OmegaConf restores flags in a ``finally`` block, where an interruption becomes an ``AttributeError``;
+    code that catches one, such as ``hasattr``, loses the signal.
     """
     whole = sweep_module.config_hash
     calls = itertools.count(1)
@@ -104,7 +104,8 @@ def stop_in_third_plan(monkeypatch, number, is_lost):
 def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(
     sweep, monkeypatch, number, is_lost
 ):
-    """It named a directory that was not there, or an override that "fits" not, or went on."""
+    """Regression: the sweep continued, or its message contained a directory that did not exist or an
+    invalid override."""
     calls = stop_in_third_plan(monkeypatch, number, is_lost)
     code, _, err = sweep("seed=1,2,3,4,5")
     assert code == 128 + number
@@ -117,7 +118,7 @@ def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(
 
 
 def test_a_sweep_that_is_stopped_between_two_runs_says_how_many_are_done(sweep, monkeypatch):
-    """The job of the second run fills its configuration when the signal arrives, and fails."""
+    """The signal arrives while the second run fills in its configuration, which then fails."""
 
     def then_stop(run, directory, stats):
         monkeypatch.setattr(application, "fill", loses_a_signal)

@@ -1,4 +1,4 @@
-"""Hydra's launchers and sweepers that come as extras, on sweeps without training."""
+"""Hydra's launchers and sweepers from extras, in sweeps without training."""
 
 import os
 from pathlib import Path
@@ -22,19 +22,19 @@ SETTINGS = {
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    # Jobs in other processes import the replacements in tests/helpers.
+    # Jobs in other processes import the test doubles in tests/helpers.
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     GlobalHydra.instance().clear()
 
 
 @pytest.mark.parametrize("launcher", sorted(SETTINGS))
 def test_launchers_run_a_sweep_once(launcher, monkeypatch, capsys, tmp_path):
-    """Jobs in other processes must find resolvers and locks, and start processes that load data; a
-    second call must run nothing."""
+    """Jobs in other processes find resolvers and locks and can start data workers; a second call runs
+    nothing."""
     module, extra, settings = SETTINGS[launcher]
     pytest.importorskip(module, reason=f"the extra {extra} is not installed", exc_type=ImportError)
     chosen = ["-m", f"hydra/launcher={launcher}", *settings, f"hydra.sweep.dir={tmp_path}", "data.workers=1"]
-    # Each job of submitit is a process that imports all.
+    # Each job of submitit is a process with its own imports.
     grid = ["seed=1,2"] if launcher == "submitit_local" else ["seed=1,2", "ablation=full,neither"]
     count = 2 ** len(grid)
     hydra_app(monkeypatch, *chosen, *grid)
@@ -46,7 +46,7 @@ def test_launchers_run_a_sweep_once(launcher, monkeypatch, capsys, tmp_path):
     assert len(executed(tmp_path)) == count
 
 
-# Replacements of the programs that submitit calls; jobs run at once on this machine.
+# Fakes of the programs that submitit calls; jobs run immediately on this machine.
 FAKES = {
     "sbatch": """#!/bin/bash
 export SLURM_ARRAY_JOB_ID=7 SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0
@@ -64,7 +64,7 @@ exec "$@"
 
 @pytest.fixture
 def slurm(monkeypatch, tmp_path):
-    """``slurm(sbatch=...)`` puts :data:`FAKES` on the path, some with another text."""
+    """``slurm(sbatch=...)`` puts :data:`FAKES` on the path, some with another script."""
     pytest.importorskip(
         "hydra_plugins.hydra_submitit_launcher",
         reason="the extra cluster is not installed",
@@ -92,7 +92,7 @@ def slurm(monkeypatch, tmp_path):
     ],
 )
 def test_what_sbatch_refuses_is_one_line(slurm, monkeypatch, capsys, tmp_path, setting, said, where):
-    """It was a traceback; a cluster without accounting is said once."""
+    """Regression: it was a traceback. Missing accounting is reported once."""
     import submitit
 
     monkeypatch.setattr(submitit.SlurmJob.watcher, "_make_command", lambda: 1 / 0)
@@ -109,7 +109,7 @@ def test_what_sbatch_refuses_is_one_line(slurm, monkeypatch, capsys, tmp_path, s
 
 
 def test_the_slurm_example_submits_what_is_missing(slurm, monkeypatch, tmp_path):
-    """The shipped example must produce valid jobs that run each run once."""
+    """The shipped example submits valid jobs, each run once."""
     slurm()
     sweep = tmp_path / "sweep"
     hydra_app(monkeypatch, "-m", "hydra/launcher=slurm", f"hydra.sweep.dir={sweep}", "seed=1,2")

@@ -1,4 +1,4 @@
-"""One run: its directory with results, sessions and lock, and what is rejected before it starts."""
+"""A single run: its directory with results, sessions and lock, and checks before it starts."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from tests.helpers.processes import PREPARED
 
 
 def test_results_that_are_not_whole_are_no_results(tmp_path):
-    """A torn ``metrics.json`` must not mark a run as done."""
+    """A truncated ``metrics.json`` must not mark a run as done."""
     run = RunDirectory(tmp_path / "run")
     assert run.state == State.MISSING
     run.path.mkdir()
@@ -56,7 +56,7 @@ FIGURES = [(f"{part}.0.psnr", value, rf"\.{part}\[0\]\.psnr") for part in ("rows
     ("place", "value", "key"), [*FIGURES, ("provenance.config.seed", 2, r": provenance\.config")]
 )
 def test_results_that_were_changed_are_refused(tmp_path, place, value, key):
-    """A changed seed would move the run to another row of a table; figures are finite numbers."""
+    """A changed seed would move the run to another table row; metrics must be finite numbers."""
     write_finished_run(tmp_path, {"seed": 1})
     path = tmp_path / "metrics.json"
     content = part = json.loads(path.read_text())
@@ -71,7 +71,7 @@ def test_results_that_were_changed_are_refused(tmp_path, place, value, key):
 
 
 def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
-    """A torn line of ``sessions.jsonl`` must not hide the sessions around it."""
+    """A truncated line of ``sessions.jsonl`` must not hide the other sessions."""
     run = RunDirectory(tmp_path)
     with run.session():
         pass
@@ -85,7 +85,7 @@ def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
 
 
 def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
-    """A killed process must not block its run, nor may a forked child that outlives it."""
+    """Neither a killed process nor a forked child that outlives it may block a run."""
     ready = PREPARED.Event()
     holder = PREPARED.Process(target=hold_run, args=(tmp_path, ready))
     holder.start()
@@ -102,7 +102,7 @@ def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
         with RunDirectory(tmp_path).claim() as again:
             assert not again
         child = os.fork()
-        if child == 0:  # like a data worker that outlives its killed parent
+        if child == 0:  # like a data worker that outlives its killed parent process
             time.sleep(30)
             os._exit(0)
     try:
@@ -118,7 +118,7 @@ def run(*overrides: str):
 
 
 def test_a_frozen_encoder_without_weights_is_refused(verb, tmp_path):
-    """The paper's sweeps would train for days on the features of a random encoder."""
+    """Otherwise the paper's sweeps would train for days on features of a random encoder."""
     for name in ("sweep=table4", "experiment=zju_mocap", "experiment=thuman2"):
         where = (f"hydra.sweep.dir={tmp_path / 'sweep'}", f"hydra.run.dir={tmp_path / 'run'}")
         code, _, err = verb(name, f"data.root={tmp_path}", *where)
@@ -141,7 +141,7 @@ def test_a_frozen_encoder_without_weights_is_refused(verb, tmp_path):
     ],
 )
 def test_encoders_that_learn_or_have_weights_pass(overrides):
-    """Fine-tuning, resumed runs and experiments on purpose must still start."""
+    """Fine-tuning, resumed runs and deliberate experiments are accepted."""
     check_config(run(*overrides))
 
 
@@ -152,7 +152,7 @@ def test_a_partly_frozen_encoder_needs_weights_too():
 
 
 def test_a_semantic_branch_needs_weights():
-    """It does not learn in training, so that it would stay random."""
+    """The branch is not trained, so it would stay random."""
     branch = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8}"
     with pytest.raises(InputError, match="init_from: expected a checkpoint of `ghgs pretext`"):
         check_config(run(branch))
@@ -161,7 +161,7 @@ def test_a_semantic_branch_needs_weights():
 
 
 def test_a_sweep_overwrites_nothing(verb, tmp_path):
-    """Sweeps go on with their own runs; ``overwrite`` would train all of them again."""
+    """Sweeps resume their runs; ``overwrite`` would train all of them again."""
     code, _, err = verb("-m", f"hydra.sweep.dir={tmp_path}", "seed=1,2", "overwrite=true")
     assert code == 1
     assert "overwrite: expected false in a sweep" in err

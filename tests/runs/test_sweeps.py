@@ -1,4 +1,4 @@
-"""Sweeps run everything once: when they grow, are interrupted, or are shared by processes."""
+"""Sweeps run each configuration once: when they grow, are interrupted, or are shared by processes."""
 
 import contextlib
 import json
@@ -28,8 +28,7 @@ pytestmark = pytest.mark.usefixtures("plans_alone")
 
 
 def test_a_grid_that_grows_runs_what_is_missing(sweep):
-    """A larger grid must not train finished runs again;
-    keys without influence must not make new runs."""
+    """A larger grid does not repeat finished runs; keys without influence create no new runs."""
     code, out, _ = sweep("seed=1,2")
     assert (code, len(executed(sweep.directory))) == (0, 2)
     code, out, _ = sweep("seed=1,2,3")
@@ -38,15 +37,15 @@ def test_a_grid_that_grows_runs_what_is_missing(sweep):
     names = executed(sweep.directory)
     assert len(names) == len(set(names)) == 3
     sweep("seed=2,3", "logger=none", "data.workers=1", "hydra.sweeper.max_batch_size=1")
-    assert executed(sweep.directory) == names  # keys without influence make no new run
+    assert executed(sweep.directory) == names  # keys without influence create no new run
     for name in names:
         source = read_results(sweep.directory / name / "metrics.json")["provenance"]
         assert name == source["config_hash"] == config_hash(source["config"])
 
 
 def test_directories_of_a_users_own_hold_one_configuration_each(sweep):
-    """A grid in directories that are numbered was "done before" and never trained,
-    for numbers begin anew."""
+    """Regression: a grid in numbered directories was "done before" and never trained, because numbering
+    restarts."""
     numbered = "hydra.sweep.subdir=${hydra.job.num}"
     code, out, _ = sweep(numbered, "seed=1,2")
     assert (code, executed(sweep.directory)) == (0, ["0", "1"])
@@ -59,7 +58,7 @@ def test_directories_of_a_users_own_hold_one_configuration_each(sweep):
 
 
 def test_a_sweep_that_goes_on_with_other_keys_says_so(sweep):
-    """All of it was trained anew, without a word of the runs that it was to go on with."""
+    """Regression: a sweep to be continued was trained anew without a message about its existing runs."""
     sweep("seed=1,2")
     changed = f"2 others in {sweep.directory} differ: optimizer.lr: "
     for words in (["dry_run=true"], []):
@@ -69,14 +68,14 @@ def test_a_sweep_that_goes_on_with_other_keys_says_so(sweep):
         assert "-> 0.5\n" in out
     for path in sweep.directory.glob("*/config.yaml"):
         path.write_text("cut: [")
-    code, out, _ = sweep("seed=7,8")  # what is damaged is not of this sweep
+    code, out, _ = sweep("seed=7,8")  # damaged runs do not belong to this sweep
     assert (code, "none of these runs" in out) == (0, False)
     _, out, _ = sweep("seed=1,2,3")  # a grid that grows
     assert "none of these runs" not in out
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused_by_the_plan(sweep, monkeypatch):
-    """The dry run was green; root may write everywhere, so that the answer of the system is invented."""
+    """Regression: the dry run passed. Root may write anywhere, so ``os.access`` is replaced."""
     access = os.access
     monkeypatch.setattr(
         os, "access", lambda path, mode: path != sweep.directory.parent and access(path, mode)
@@ -91,7 +90,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_by_the_plan(sweep, monkey
 
 
 def test_a_checkpoint_that_cannot_be_read_is_said_by_the_plan(sweep):
-    """Only the run itself said it, after it was queued; deleting the file was not proposed."""
+    """Regression: only the queued run reported it, without proposing to delete the file."""
     sweep("seed=1,2")
     (name, _) = executed(sweep.directory)
     (sweep.directory / name / "metrics.json").unlink()
@@ -115,7 +114,7 @@ def test_two_runs_in_one_directory_are_refused_before_any_is_trained(sweep):
 
 
 def test_directories_may_say_what_sets_them_apart(sweep):
-    """Hydra's own idiom, whose names need quotes."""
+    """Hydra's ``override_dirname`` idiom, whose values need quotes."""
     grid = ("hydra.sweep.subdir=${hydra.job.override_dirname}", "seed=1,2", "evaluation.views=[4]")
     for _ in range(2):
         code, _, err = sweep(*grid)
@@ -124,8 +123,7 @@ def test_directories_may_say_what_sets_them_apart(sweep):
 
 
 def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
-    """A plan must not start training, and its expected time must follow from budgets and
-    measured steps."""
+    """A plan starts no training; its expected time follows from budgets and measured steps."""
     code, out, _ = sweep("seed=1,2", "dry_run=true", "trainer.max_steps=100")
     assert code == 0
     assert not sweep.directory.exists()
@@ -143,7 +141,7 @@ def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
 
 
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
-    """One bad run must not cost the rest of the night."""
+    """One failing run must not stop an overnight sweep."""
 
     def bad(run, directory, stats):
         if run.seed == 1:
@@ -159,7 +157,7 @@ def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
 
 
 def test_an_impossible_job_fails_before_any_is_launched(sweep):
-    """A bad value must be found before hours of training, not at its turn."""
+    """An invalid value is found before hours of training."""
     code, _, err = sweep("seed=1,-2")
     assert code == 1
     assert "seed: expected an integer >= 0" in err
@@ -184,7 +182,7 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     ],
 )
 def test_one_process_may_be_said_in_several_ways(monkeypatch, trainer, fits):
-    """``[1]`` is the second GPU alone; ``auto`` is one on a CPU. Here with two GPUs."""
+    """``[1]`` is only the second GPU; ``auto`` is one process on a CPU. The test simulates two GPUs."""
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
     base = run_of("train", ["trainer=gpu"])
     run = base.replace(trainer={**base.plain["trainer"], **trainer})
@@ -196,7 +194,7 @@ def test_one_process_may_be_said_in_several_ways(monkeypatch, trainer, fits):
 
 
 def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
-    """Two processes on one sweep must not train a run twice, and both must end with all results."""
+    """Two processes on one sweep train no run twice, and both end with all results."""
     count, barrier = 8, PREPARED.Barrier(2)
     processes = [PREPARED.Process(target=work_through, args=(tmp_path, count, barrier)) for _ in range(2)]
     for process in processes:
@@ -211,7 +209,7 @@ def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
 
 
 def test_a_sweep_returns_to_runs_that_others_worked_on(tmp_path):
-    """A run that another process held must be launched again: that process may have died."""
+    """A run locked by another process is launched again, because that process may have died."""
     items, launched = plan_seeds(tmp_path, 2), []
 
     def launch(jobs, first):
@@ -224,7 +222,7 @@ def test_a_sweep_returns_to_runs_that_others_worked_on(tmp_path):
 
 
 def test_the_command_line_replaces_a_sweeps_own_values():
-    """``seed=7`` must replace the three seeds of a named sweep, not add to them."""
+    """``seed=7`` replaces the three seeds of a named sweep instead of adding to them."""
     own = {"seed": "1,2,3", "views": "v4"}
     assert combinations(own, ["seed=7", "model=hull"]) == [["views=v4", "seed=7", "model=hull"]]
     assert len(combinations(own, ["ablation=full,neither"])) == 6
@@ -239,7 +237,7 @@ def test_a_sweep_over_all_options_of_a_group(monkeypatch, capsys, tmp_path):
 
 @pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
 def test_time_budgets(value, seconds):
-    """Expected times of a plan depend on both forms that Lightning accepts."""
+    """Expected times of a plan depend on both formats that Lightning accepts."""
     assert time_budget(TrainerOptions(max_time=value)) == seconds
 
 
@@ -257,7 +255,7 @@ def composed(*overrides: str):
     ],
 )
 def test_named_sweeps(name, count, data):
-    """The paper's tables need exactly these runs."""
+    """The paper's tables require exactly these runs."""
     cfg = composed(f"sweep={name}")
     assert cfg.hydra.mode.name == "MULTIRUN"
     assert cfg.data.name == data
@@ -266,7 +264,7 @@ def test_named_sweeps(name, count, data):
 
 
 def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
-    """Without its own mode ``sweep=table4`` would train a single run."""
+    """Without its own mode, ``sweep=table4`` would train a single run."""
     there = f"hydra.sweep.dir={tmp_path}"
     code, out, _ = call(monkeypatch, capsys, "train", "sweep=table4", "seed=1", "dry_run=true", there)
     assert code == 0
@@ -274,7 +272,7 @@ def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
 
 
 def test_a_file_of_ones_own_may_say_that_it_is_a_sweep(sweep, tmp_path, monkeypatch, capsys):
-    """Its directory is ``hydra.sweep.dir``, without a flag."""
+    """Its directory is ``hydra.sweep.dir``, also without a flag."""
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     own = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '1,2'}}}\n"
     (tmp_path / "conf" / "experiment" / "mine.yaml").write_text(own)
@@ -284,7 +282,7 @@ def test_a_file_of_ones_own_may_say_that_it_is_a_sweep(sweep, tmp_path, monkeypa
 
 
 def test_tables_share_runs_and_take_other_data(sweep):
-    """A run that two tables need must have one hash, and data of the command line another."""
+    """A run shared by two tables has one hash; other data on the command line changes the hash."""
 
     def names(*overrides):
         code, out, err = sweep("dry_run=true", "seed=1", *overrides)

@@ -1,5 +1,4 @@
-"""What a run of a grid is called where runs are compared: by what sets it apart,
-not by its hash."""
+"""Titles of grid runs where runs are compared: the distinguishing overrides instead of the hash."""
 
 from pathlib import Path
 
@@ -15,7 +14,7 @@ SHARED = ("experiment=demo", "data.root=a/b", "evaluation.views=[3,4]")
 
 
 def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
-    """The runs of a grid, each said as ``ablation=full seed=1``, after its plan is written."""
+    """Directories of a grid's runs, each given as ``ablation=full seed=1``, after its plan is written."""
     items = []
     for text in grid:
         shown, name = (*shared, *text.split()), f"{abs(hash((text, shared))):x}"[:12]
@@ -25,8 +24,7 @@ def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
 
 
 def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
-    """TensorBoard's files lie in folders of these names, below the sweep's;
-    a seed is always said."""
+    """TensorBoard files lie in folders of these names below the sweep's; seeds are always included."""
     runs = planned(tmp_path, "ablation=full seed=1", "ablation=neither seed=1", "+optimizer.lr=0.1 seed=1")
     expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "lr=0.1,seed=1"]
     assert [run.title for run in runs] == expected
@@ -35,8 +33,7 @@ def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
 
 
 def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
-    """Also where the longer grid says more of it;
-    other settings of the same name get their hash."""
+    """Also if the larger grid would add keys to it; other settings with the same title get their hash."""
     (first,) = planned(tmp_path, "seed=1", shared=("ablation=full",))
     assert first.title == "ablation=full,seed=1"
     again, other = planned(tmp_path, "seed=1", "seed=2", shared=("ablation=full",))
@@ -48,7 +45,7 @@ def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
 
 
 def test_two_runs_of_one_title_keep_their_curves_apart(tmp_path):
-    """A run that another command has called the same does not write into the files of the first."""
+    """A run with the same title from another command does not write into the files of the first."""
     runs = planned(tmp_path, "seed=1", "seed=2", shared=())
     for run in runs:
         (run.path / "swept.json").write_text('["seed=1"]')
@@ -66,7 +63,7 @@ def test_a_run_of_its_own_has_its_files_in_its_folder(tmp_path):
 
 
 def test_names_are_those_of_folders(tmp_path):
-    """Of a value that is a path, and of one that is long."""
+    """Titles of a value that is a path, and of a long one."""
     long = "x" * 300
     runs = planned(tmp_path, "init_from=a/b.ckpt seed=1", f"init_from={long} seed=2", shared=())
     assert runs[0].title == "init_from=a_b.ckpt,seed=1"

@@ -1,4 +1,4 @@
-"""Freed memory that is used again."""
+"""Reuse of freed memory."""
 
 import platform
 
@@ -25,6 +25,5 @@ def test_freed_memory_is_used_again_where_the_user_set_no_limits(monkeypatch, li
         monkeypatch.delenv(name, raising=False)
     said, faults = run_python(CODE, **limits).stdout.split()
     assert said == asked
-    # 64 MB are 16384 pages. Where blocks are used again they first find their places,
-    # for some rounds.
+    # 64 MB are 16384 pages. Reused blocks settle at their addresses within some rounds.
     assert (int(faults) < 1000) == (asked == "True")

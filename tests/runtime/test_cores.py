@@ -1,4 +1,4 @@
-"""Cores that a process may use."""
+"""CPU cores that a process may use."""
 
 import os
 
@@ -19,7 +19,7 @@ from ghgs_lit.runtime import cores
     ],
 )
 def test_affinity_and_quota_limit_the_cores(monkeypatch, tmp_path, files, expected):
-    """Of a machine of 64 cores a job may have six, its container fewer."""
+    """On a machine with 64 cores, a job may use six, its container fewer."""
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)), raising=False)
     (tmp_path / "cpu").mkdir()
@@ -29,7 +29,7 @@ def test_affinity_and_quota_limit_the_cores(monkeypatch, tmp_path, files, expect
 
 
 def test_one_process_of_a_machine_spins_where_nothing_else_runs(monkeypatch, tmp_path):
-    """Its children do not, nor one that starts beside it, nor one of several."""
+    """Its children do not spin, nor do a second process and one of several."""
     monkeypatch.setattr(cores.tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(cores, "_spins", [])
     monkeypatch.setattr(os, "environ", {})
