@@ -1,4 +1,4 @@
-"""Checks annotated shapes, composes faster, and limits the threads of each test process."""
+"""Check annotated shapes, speed up composing, and limit the threads of each test process."""
 
 import gc
 import logging
@@ -11,26 +11,26 @@ from pathlib import Path
 
 import pytest
 
-# Where Python keeps no bytecode, as in many containers, each process that a test starts compiles
-# PyTorch and Lightning anew, which takes longer than most tests.
+# Without bytecode files, as in many containers, each process started by a test compiles PyTorch and
+# Lightning anew, which takes longer than most tests.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from tests.helpers.shapes import begin_test, check_shapes  # noqa: E402
 
-# Modules and tests are no garbage, and looking through what is left takes a tenth of the suite: it
-# is done between tests, now and then, also where a verb turns the collector on again.
+# Garbage collection would take a tenth of the suite's time. It runs only between some tests, even where a
+# verb re-enables it; modules and tests are excluded.
 gc.set_threshold(0)
 _TESTS_BETWEEN = 64
 
 # Test processes and their children share the cores; more threads than cores slow each other down,
-# and those that spin while they wait do so most.
+# most of all if they spin while waiting.
 _THREADS = max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 os.environ |= {"OMP_NUM_THREADS": str(_THREADS), "OMP_WAIT_POLICY": "PASSIVE"}
 
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
 _CHECKED = ["extents", "types", "losses", "metrics"]
-# Without their folders of kernels: a wrapped function cannot be compiled.
+# Without their kernel folders: a wrapped function cannot be compiled.
 for name in (
     "method.bounds",
     "method.encoder",
@@ -45,7 +45,7 @@ check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 import torch  # noqa: E402
 from hydra.core.hydra_config import HydraConfig  # noqa: E402
 
-# Kernels in Triton run on tensors of the CPU where there is no GPU; read when Triton is imported.
+# Without a GPU, Triton kernels run on CPU tensors; Triton reads this variable on import.
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
 
@@ -53,7 +53,7 @@ import tests.helpers.composing  # noqa: E402, F401
 from ghgs_lit.config.registry import load_plugins  # noqa: E402
 from ghgs_lit.geometry.precision import _Rounding  # noqa: E402
 
-load_plugins()  # before any test has a register of its own
+load_plugins()  # before any test replaces the registry
 
 torch.set_num_threads(_THREADS)
 
@@ -62,7 +62,7 @@ if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-#: Variables that a verb and Lightning set for the rest of their process.
+#: Environment variables that a verb and Lightning set for the rest of their process.
 _LEFT = ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS")
 
 
@@ -77,14 +77,16 @@ def _as_at_first() -> None:
             os.environ[name] = value
     for device, rounding in _ROUNDING.items():
         rounding.restore(device)
-    HydraConfig.instance().cfg = None  # by which a job knows that it is one of a sweep
+    HydraConfig.instance().cfg = None  # marks a job as part of a sweep
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_left_to_the_next_test() -> Iterator[None]:
-    """A verb may change its process, which ends with it: variables, the precision of products, logs
-    (whose streams are those of one test, and whose files are in its folder). A fixture of a whole
-    module may have called one before."""
+    """Undo changes that a verb makes to its process: variables, precision of products, and log handlers,
+    whose streams and files belong to one test.
+
+    Also undone before a test, because a module-scoped fixture may have called a verb.
+    """
     _as_at_first()
     root = logging.getLogger()
     handlers = list(root.handlers)

@@ -1,4 +1,4 @@
-"""Batches that the model refuses, and what it says of them."""
+"""Batches that the model rejects, and the error messages."""
 
 import dataclasses
 import functools
@@ -72,18 +72,19 @@ def spoiled(name, index, value):
     ],
 )  # fmt: skip
 def test_broken_values_are_refused_where_they_are(changes, message):
-    """One NaN in the background left no Gaussian, in silence;
-    photographs as uint8 gave colours of 254."""
+    """Regression: one NaN in the background silently removed all Gaussians; uint8 images gave colours of
+    254."""
     batch = make_batch(1, 2)
     for name, value in changes.items():
-        object.__setattr__(batch, name, value)  # the types' own checks run in tests only
+        object.__setattr__(batch, name, value)  # the shape checks of types run only in tests
     model = make_model("model=paper")
     with pytest.raises(InputError, match=message):
         predict(model, batch)
 
 
 def test_checks_of_values_can_be_left_out():
-    """Somebody who checked the values already pays nothing; others are refused by the model."""
+    """Checks can be disabled for values that are already checked; by default the model rejects invalid
+    ones."""
     bad = dataclasses.replace(make_batch(1, 2), **spoiled("images", (0, 1, 2, 0, 0), torch.nan))
     model = make_model("model=paper")
     with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
@@ -93,6 +94,6 @@ def test_checks_of_values_can_be_left_out():
 
 @pytest.mark.parametrize("message", list(bad_batches()))
 def test_a_bad_batch_is_refused_by_name(message):
-    """Bad input must be refused with the name of the field."""
+    """Invalid input is rejected with the name of the field."""
     with pytest.raises(InputError, match=message):
         refuse(findings_of(bad_batches()[message], 14))

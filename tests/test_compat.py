@@ -1,4 +1,4 @@
-"""The release's quirks are switches, off by default; what new training does instead is safe."""
+"""The release's quirks are switches that are off by default; new training uses safe alternatives."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ from tests.helpers.scenes import make_batch
 from tests.helpers.weights import PUBLISHED
 from tests.helpers.weights import config as imported_config
 
-#: What a new model of the paper does, beside what the release does (docs/reproduce.md).
+#: Values of new models, and those of the release (docs/reproduce.md).
 QUIRKS = {
     ("model", "pad"): ("none", "multiple"),
     ("unprojection", "tokens"): ("subject", "release"),
@@ -35,13 +35,13 @@ VERBS = [path.stem for path in CONF.glob("*.yaml") if "- compat:" in path.read_t
 
 @pytest.mark.parametrize(("key", "values"), QUIRKS.items())
 def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
-    """New training must not inherit the release's quirks, and each must be selectable alone."""
+    """New training must not inherit the release's quirks, and each can be selected separately."""
     group, name = key
     assert config("model=paper")[group][name] == values[0]
     assert config("model=paper", "compat=release")[group][name] == values[1]
     assert release_switches()[key] == values[1]
     overrides = [f"{group}.{name}={values[1]}"]
-    if group in ("bounds", "depth_head"):  # depths without bounds are the release's alone
+    if group in ("bounds", "depth_head"):  # only the release has depths without bounds
         overrides = ["bounds.kind=none", "depth_head.parameterization=inverse_linear"]
     with torch.device("meta"):
         GHGS.from_config(config("model=paper", *overrides))
@@ -49,7 +49,7 @@ def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
 
 @pytest.mark.parametrize("model", ["paper", "hull"])
 def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
-    """The authors' checkpoint must fit whatever `model` is chosen."""
+    """The authors' checkpoint must fit for any chosen `model`."""
     overrides = [f"model={model}", "compat=release"]
     state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=True).state_dict()
     found = {
@@ -62,17 +62,17 @@ def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_releases_protocol_of_measuring_comes_with_it(verb):
-    """Numbers beside the release's must be measured as the release does."""
+    """Metrics compared with the release's must be computed as in the release."""
     cfg = OmegaConf.to_container(compose(verb, ["compat=release"]))
     chosen = OmegaConf.to_container(compose(verb, ["compat=release", "metrics=correct"]))
     assert cfg["metrics"]["protocol"] == "release"
     assert cfg["metrics"]["regions"] == ["image"]
-    assert cfg["metrics"]["lpips"] == "require"  # it is not dropped beside the paper's
+    assert cfg["metrics"]["lpips"] == "require"  # required to compare with the paper
     assert chosen["metrics"]["protocol"] == "correct"
 
 
 def token_pixels(mode, size=512):
-    """Where the tokens of two full masks lie in the photographs: ``[37, 37, 2]``."""
+    """Pixel coordinates of the tokens of two full masks: ``[37, 37, 2]``."""
     batch = make_batch(1, 2, size, size)
     depth = torch.full_like(batch.depths, 2.0)
     padded = torch.nn.functional.pad(depth, (3, 3, 3, 3), value=2.0)
@@ -91,14 +91,14 @@ def token_pixels(mode, size=512):
 
 
 def test_tokens_lie_at_the_true_centres_and_the_releases_where_it_puts_them():
-    """Token points must be right for ours and as shifted as the release's."""
+    """Token points are correct by default, and shifted as in the release with its switch."""
     index = torch.arange(37) + 0.5
     v, u = torch.meshgrid(index, index, indexing="ij")
     grid = torch.stack((u, v), -1)
     true, quirk = 14 * grid - 3, grid * 512 / 37
     torch.testing.assert_close(token_pixels("subject"), true, atol=2e-3, rtol=0)
     torch.testing.assert_close(token_pixels("release"), quirk, atol=2e-3, rtol=0)
-    # As measured on the authors' code: up to 2.92 px an axis, 0 at the centre.
+    # As measured with the authors' code: up to 2.92 px per axis, 0 at the centre.
     assert (true - quirk).abs().max() == pytest.approx(2.92, abs=5e-3)
 
 
@@ -107,7 +107,7 @@ EXTREMES = torch.tensor([-torch.inf, -1e30, -1e4, -80.0, 0.0, 80.0, 1e4, 1e30, t
 
 @pytest.mark.parametrize("name", list(BOUNDED))
 def test_no_value_of_the_head_flips_or_explodes_a_depth(name):
-    """Whatever a network says, depths lie between near and far, and so do their gradients."""
+    """For any network output, depths lie between near and far, and their gradients are bounded."""
     batch = make_batch(1, 3)
     torch.manual_seed(0)
     head = DepthHeadOptions(parameterization=name).build(64)
@@ -131,7 +131,7 @@ def test_no_value_of_the_head_flips_or_explodes_a_depth(name):
 
 
 def test_a_fresh_model_of_the_release_may_look_behind_the_camera_and_ours_not():
-    """Eight of twenty seeds of the release's parameterisation put the body behind every camera."""
+    """Eight of twenty seeds of the release's parameterization put the body behind every camera."""
     batch = make_batch(1, 3)
     behind = {name: 0 for name in ("paper", "release")}
     for seed in range(6):
@@ -145,7 +145,7 @@ def test_a_fresh_model_of_the_release_may_look_behind_the_camera_and_ours_not():
 
 
 def test_background_tokens_take_part_by_a_switch():
-    """Background tokens must take part under recalibration.tokens=all only."""
+    """Background tokens take part only with recalibration.tokens=all."""
     batch = make_batch(1, 3, 56, 56, zoom=0.4)
     touched = {}
     for tokens in ("subject", "all"):

@@ -1,5 +1,5 @@
-"""The experiment with controls in ``examples/controls``:
-rows that must lose and win do what they say."""
+"""The experiment with controls in ``examples/controls``: rows that must lose or win implement what their
+names describe."""
 
 import dataclasses
 import sys
@@ -25,7 +25,7 @@ OWN = ("residual", "shuffled", "relative")
 
 @pytest.fixture
 def controls(monkeypatch):
-    """The plug-in; parts of bodies, which these bodies do not have, are drawn."""
+    """The plug-in, with random body parts, which these bodies lack."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
     monkeypatch.setenv(registry.VARIABLE, str(FOLDER / "controls.py"))
@@ -38,14 +38,14 @@ def controls(monkeypatch):
 
 
 def config(*overrides):
-    """The nodes of the experiment's model."""
+    """Model nodes of the experiment."""
     small = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.num_heads=2"]
     searched = f"hydra.searchpath=[file://{FOLDER / 'conf'}]"
     return OmegaConf.to_container(compose("train", [searched, "sweep=controls", *small, *overrides]))
 
 
 def model_of(**recalibration):
-    """The experiment's model with some keys of the recalibration."""
+    """The experiment's model with some keys of the recalibration changed."""
     nodes = config()
     nodes["recalibration"] |= recalibration
     torch.manual_seed(0)
@@ -65,7 +65,7 @@ def calls_of(model, batch):
 
 
 def test_the_rows_are_the_papers_and_three_more(controls):
-    """One configuration each, which differs from the whole method in what the row's name says."""
+    """Each row is one configuration, which differs from the full method only as its name describes."""
     composed = {name: config(f"ablation={name}") for name in (*ABLATIONS.values(), *OWN)}
     rows = composed["full"]["recalibration"]
     assert (rows["kind"], rows["control"], rows["k"], rows["positions"]) == ("control", "none", 0.1, "none")
@@ -89,7 +89,7 @@ def test_without_the_plug_in_nobody_meets_a_control():
 
 
 def test_the_residual_is_that_of_the_true_surface(controls):
-    """A prediction of the true depths has none; one that is 1 % too far has 1 % of the distance."""
+    """Zero for predictions of the true depths; 1 % of the distance for depths that are 1 % too large."""
     batch = training_batch(2, 56)
     tokens, points, result = calls_of(model_of(control="residual"), batch)
     unproject = controls.KnownUnprojection()
@@ -100,7 +100,7 @@ def test_the_residual_is_that_of_the_true_surface(controls):
     centers = batch.cameras.centers.flatten(0, 1)[tokens.image]
     expected = 0.01 / 1.01 * (centers - far.tokens)
     torch.testing.assert_close(far.residual[where], expected[where], atol=1e-5, rtol=0)
-    # Where the tokens' own residual says so, the point of the prediction comes to the surface.
+    # Adding the tokens' residual moves predicted points to the surface.
     surface = unproject_maps(batch.depths, batch.cameras).flatten(0, 3)
     moved = (points.tokens + points.residual)[where]
     seen = surface[batch.masks.flatten()]
@@ -112,7 +112,7 @@ def test_the_residual_is_that_of_the_true_surface(controls):
 
 
 def test_shuffled_tokens_are_those_of_the_same_subject_elsewhere(controls):
-    """A permutation of what the whole method gives; nothing else changes."""
+    """A permutation of the full method's tokens; nothing else changes."""
     batch = training_batch(2, 56)
     tokens, points, whole = calls_of(model_of(), batch)
     _, _, shuffled = calls_of(model_of(control="shuffled"), batch)
@@ -136,7 +136,7 @@ def test_attention_knows_the_true_parts(controls, monkeypatch):
     for similarity in ("product", "none"):
         model = model_of(similarity=similarity)
         tokens, points, result = calls_of(model, batch)
-        # as pictures of attention see them
+        # as shown in pictures of attention
         assert torch.equal(tokens.semantic, points.shares.sqrt())
         results = [result.latent[3]]
         with monkeypatch.context() as patched:

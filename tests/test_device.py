@@ -1,5 +1,4 @@
-"""The whole package on a device that refuses to mix with the CPU:
-what a GPU would refuse fails here."""
+"""The whole package on a pretend device that rejects mixing with the CPU, as a GPU would."""
 
 import dataclasses
 
@@ -44,7 +43,7 @@ REFERENCE = Renderer(backend="reference")
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Images this small gain nothing from threads."""
+    """Images of this size gain nothing from threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -52,7 +51,7 @@ def one_thread():
 
 
 def full_batch(count=2):
-    """Elements with all that data can have; the first view is the target, too."""
+    """Elements with everything that data can contain; the first view is also the target."""
     batch = make_batch(count, 3, 28, 42)
     generator = torch.Generator().manual_seed(0)
     return dataclasses.replace(
@@ -66,7 +65,7 @@ def full_batch(count=2):
 @pytest.mark.parametrize("skip", PRESETS)
 @pytest.mark.parametrize("kind", MODELS)
 def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
-    """A tensor made on the wrong device fails at its line."""
+    """A tensor created on the wrong device fails at its line."""
     model, batch = make_model(kind, f"skip={skip}").eval(), make_batch(2, 3, 28, 42)
     with torch.no_grad():
         expected = predicted(model, batch)
@@ -74,20 +73,20 @@ def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
             found = predicted(model.to(DEVICE), batch.to(DEVICE))
             assert found.gaussians.means.device == found.points.tokens.device == DEVICE
             found = found.to("cpu")
-    # Unbounded depths amplify rounding.
+    # Unbounded depths amplify rounding errors.
     close(found.gaussians, expected.gaussians, 1e-3 if kind == "compat=release" else 1e-6)
     assert torch.equal(found.depth_valid, expected.depth_valid)
 
 
 class PretendAccelerator(CPUAccelerator):
-    """What Lightning asks of an accelerator."""
+    """Accelerator for Lightning on the pretend device."""
 
     def setup_device(self, device):
-        """Nothing, where a CPU's would refuse the device."""
+        """Do nothing; the CPU's accelerator would reject the device."""
 
 
 def train(folder, **place):
-    """Two steps and a validation with callbacks; gives the module."""
+    """Module after two steps and a validation with callbacks."""
     options = Optimization(lr=1e-3, warmup=0.0, freeze_until={"gaussian_head.opacity": 0.4})
     module = GHGSModule(
         make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull")
@@ -113,8 +112,11 @@ def train(folder, **place):
 
 
 def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywhere(tmp_path, monkeypatch):
-    """Steps with clipping, a validation, callbacks; the checkpoint goes to the CPU and back. What a
-    step logs is there already: Lightning would copy a number, for which the host waits."""
+    """Steps with clipping, a validation and callbacks; the checkpoint loads on the CPU and back.
+
+    Logged values of a step are tensors on the device: copying a Python number would synchronize it with
+    the host.
+    """
     log_dict, logged = GHGSModule.log_dict, {}
 
     def noted(self, values, **options):
@@ -141,7 +143,7 @@ def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywh
 
 
 def test_batches_are_copied_there_without_a_wait():
-    """From pinned memory such copies run beside the step before."""
+    """From pinned memory such copies overlap with the previous step."""
     module = GHGSModule(make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), Optimization(lr=1e-3), {})
     with pretend_device() as log:
         batch = module.transfer_batch_to_device(full_batch(), DEVICE, 0)
@@ -153,8 +155,8 @@ def test_batches_are_copied_there_without_a_wait():
 
 
 def test_everything_is_measured_there(tmp_path, monkeypatch):
-    """The model, refined too, and all baselines, with all metrics and pictures:
-    rows are those of the CPU."""
+    """The model, with refinement, and all baselines, with all metrics and pictures: same rows as on the
+    CPU."""
     monkeypatch.setattr("ghgs_lit.refinement.cameras._STEPS", 3)
     metrics = MetricsOptions(regions=("image", "box", "subject", "edge"), lpips="off").build()
 
@@ -186,7 +188,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
 
 
 def test_predict_runs_there(tmp_path, monkeypatch):
-    """From photographs on disk to a splat and a turntable on disk."""
+    """From images on disk to a splat and a turntable on disk."""
     render_boxes(tmp_path / "data", tmp_path / "scans", train=1, val=1)
     checkpoint = tmp_path / "a.ckpt"
     write_checkpoint(checkpoint, make_model("model=hull").state_dict(), config("model=hull"))
@@ -207,8 +209,8 @@ def test_predict_runs_there(tmp_path, monkeypatch):
     ids=" ".join,
 )
 def test_the_host_waits_once(overrides):
-    """For the plan: the check of the batch, the subject's extent,
-    the numbers of tokens and Gaussians."""
+    """One synchronization, for the plan: check of the batch, extent of the subject, numbers of tokens and
+    Gaussians."""
     waits = []
     for size in (1, 2):
         with torch.no_grad(), pretend_device(True) as log:
@@ -220,7 +222,7 @@ def test_the_host_waits_once(overrides):
 
 
 def test_the_hull_of_larger_photographs_is_found_without_asking_for_the_number_of_rays(monkeypatch):
-    """As on a CPU, though more rays are marched than there are: the first is repeated."""
+    """As on a CPU, although the rays are padded by repeating the first one."""
     monkeypatch.setattr(box, "RESOLUTION", 28)
     monkeypatch.setattr(ray_marching, "_DEPTHS", (20_000, 20_000))
     stage, batch = make_model("model=hull").bounds, make_batch(2, 3, 56, 42)
@@ -229,14 +231,14 @@ def test_the_hull_of_larger_photographs_is_found_without_asking_for_the_number_o
         there = batch.to(DEVICE)
         log.clear()
         found = stage(there)
-        assert log.waits.total() == 1  # for the extents, which other stages read, too
+        assert log.waits.total() == 1  # for the extents, which other stages read as well
         found = found.to("cpu")
     torch.testing.assert_close(found.near, expected.near, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(found.far, expected.far, atol=1e-5, rtol=1e-5)
 
 
 class Planted:
-    """A stage with a defect in front of it."""
+    """A stage with a planted defect in its input."""
 
     def __init__(self, stage, defect):
         self.stage, self.defect = stage, defect
@@ -272,7 +274,7 @@ def _index_on_the_cpu(maps):
     ],
 )
 def test_a_planted_defect_is_caught(defect, said):
-    """Each works on the CPU and fails on a GPU, or waits there without need."""
+    """Each defect works on the CPU, but fails on a GPU or synchronizes there without need."""
     model, batch = make_model("model=paper").eval(), make_batch(1, 3, 28, 42)
     model.unprojection = Planted(model.unprojection, defect)
     with torch.no_grad():
@@ -284,7 +286,7 @@ def test_a_planted_defect_is_caught(defect, said):
 
 
 def test_calls_and_waits_are_counted_by_stage(monkeypatch, capsys):
-    """The counts of a prediction and of a training step that the guide of GPUs shows."""
+    """Counts of a prediction and of a training step, as shown in the guide on GPUs."""
     small = "device.py model=recurrent rounds.slopes=true --batches 1 --views 2 --size 28"
     monkeypatch.setattr("sys.argv", small.split())
     device_counts.main()

@@ -1,5 +1,4 @@
-"""Paths, config groups, keys and names in the documents exist,
-and their commands of some seconds run."""
+"""Paths, config groups, keys and names in the documents exist, and their fast commands run."""
 
 import importlib.util
 import pydoc
@@ -34,7 +33,7 @@ VERBS = (
     "view",
     "doctor",
 )
-# What a reader makes, and options and names that are not in this repository.
+# Files that readers create, and options and names that are not in this repository.
 MADE = ("conf/data/my_people.yaml", "conf/sweep/<name>.yaml")
 OPTIONS = {
     "ablation": {"one_neighbor", "residual", "shuffled", "relative"},
@@ -43,14 +42,14 @@ OPTIONS = {
     "model": {"gps"},
     "hydra/launcher": {"joblib", "submitit_local"},
 }
-# a group of entry points, and the format of a file
+# a group of entry points, and a file format
 NO_MODULES = {"ghgs_lit.plugins", "ghgs_lit.others"}
 
 
 def _script(name: str):
     spec = importlib.util.spec_from_file_location(name, REPOSITORY / "scripts" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
+    sys.modules[name] = module  # dataclasses look up their module
     spec.loader.exec_module(module)
     return module
 
@@ -60,12 +59,12 @@ DOCUMENTS = check_documents.documents()
 
 
 def code(document: str) -> list[str]:
-    """Code of a document, each span on one line: in running text, and in blocks except Python."""
+    """Code of a document, each span on one line: inline code, and blocks in languages other than Python."""
     text = (REPOSITORY / document).read_text()
     named = re.findall(r"^```(\w*)\n(.*?)^```", text, re.M | re.S)
     blocks = [block for language, block in named if language != "python"]
     prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
-    # what made a table, and is not needed any more
+    # commands that once produced a table
     prose = re.sub(r"`[^`]*` of commit \w+", "", prose)
     return [" ".join(s.split()) for s in [*re.findall(r"(?<!`)`([^`]+)`(?!`)", prose), *blocks]]
 
@@ -83,7 +82,7 @@ def groups() -> dict[str, set[str]]:
 
 @lru_cache
 def keys() -> frozenset[str]:
-    """Dotted keys of all verbs and of every option of every group, inner nodes included."""
+    """Dotted keys of all verbs and of every option of every group, including inner nodes."""
     found: set[str] = set()
 
     def collect(node: object, prefix: str = "") -> None:
@@ -96,7 +95,7 @@ def keys() -> frozenset[str]:
         for group, options in groups().items()
         if "/" not in group and group not in ("experiment", "sweep", "calibration")
     ]
-    # One option of each group at a time: composing takes a third of a second.
+    # One option per group in each run, because composing takes a third of a second.
     runs = [(verb, []) for verb in VERBS]
     runs += [("train", [*filter(None, chosen)]) for chosen in zip_longest(*shipped)]
     runs.append(("train", ["feature_cache.kind=disk"]))
@@ -106,7 +105,7 @@ def keys() -> frozenset[str]:
 
 
 def is_key(name: str) -> bool:
-    """Whether a verb has the key; within its section a text may leave the beginning out."""
+    """Whether a verb has the key; a document may omit its beginning."""
     return name in keys() or any(key.endswith(f".{name}") for key in keys())
 
 
@@ -121,7 +120,7 @@ def _missing_paths(document: str) -> list[str]:
 
 
 def test_paths_exist():
-    """A file that was moved must not live on in links and paths of the documents."""
+    """Links and paths in the documents must not refer to moved files."""
     missing = {document: _missing_paths(document) for document in DOCUMENTS}
     assert not any(missing.values()), missing
 
@@ -142,18 +141,18 @@ def test_packages_exist():
 
 
 def test_names_of_the_package_exist():
-    """``ghgs_lit.data.reader.Reader`` and the like must be importable, also in Python blocks."""
+    """Names such as ``ghgs_lit.data.reader.Reader`` must be importable, also in Python blocks."""
     text = "\n".join((REPOSITORY / document).read_text() for document in DOCUMENTS)
     named = {name.rstrip(".") for name in re.findall(r"(?<![\w/])ghgs_lit(?:\.[A-Za-z]\w*)+", text)}
     assert not [name for name in named - NO_MODULES if pydoc.locate(name) is None]
 
 
 def test_options_and_keys_exist():
-    """Each ``group=option`` must be a file of ``conf`` or ``--config-dir``,
-    ``key=value`` a key of a verb."""
+    """Each ``group=option`` is a file of ``conf`` or ``--config-dir``, each ``key=value`` a key of a
+    verb."""
     wrong = []
     for span in (span for document in DOCUMENTS for span in code(document)):
-        # values of Python, in calls, are none of a configuration
+        # Python values in calls are not configuration values
         for name, value in re.findall(r"(?<![\w.$<{+/-])([a-z][\w./]*)=([^\s'`]*)", span):
             if name in groups():
                 options = re.findall(r"[a-z]\w*", value) if re.match(r"[a-z]", value) else []
@@ -205,8 +204,7 @@ def test_stale_figures_are_found(document, change, expected, tmp_path, monkeypat
 
 
 def test_promised_pythons_agree():
-    """README, package, linter and the script that tests them must promise the same
-    versions of Python."""
+    """README, package, linter and the script that tests them state the same versions of Python."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
     oldest, last = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["project"]["requires-python"]).groups()
     versions = [f"3.{minor}" for minor in range(int(oldest), int(last))]
@@ -216,13 +214,12 @@ def test_promised_pythons_agree():
     assert f"Python {versions[0]} to {versions[-1]} on" in (REPOSITORY / "README.md").read_text()
     assert f"{versions[0]} {versions[-1]}" in (REPOSITORY / "scripts" / "test_pythons.sh").read_text()
     markers = re.findall(r"python_version . \W3\.(\d+)", (REPOSITORY / "constraints.txt").read_text())
-    # no pins of versions that are not promised
+    # no pins for unsupported versions
     assert all(int(oldest) < int(minor) for minor in markers)
 
 
 def test_commands_are_read_whole(tmp_path, monkeypatch):
-    """Continuation lines, comments, Python blocks and commands in running text must
-    all be found."""
+    """Continuation lines, comments, Python blocks and commands in running text are all found."""
     text = "`ghgs table\nruns=x` `ghgs table`\n```bash\n# no\nghgs train a=1 \\\n    'b=#2'  # yes\n```\n"
     (tmp_path / "a.md").write_text(f"{text}```python\nx = 1\ny = 2\n```\n")
     monkeypatch.setattr(check_documents, "ROOT", tmp_path)
@@ -235,8 +232,7 @@ def test_commands_are_read_whole(tmp_path, monkeypatch):
 
 
 def test_commands_for_a_gpu_are_run_on_a_cpu():
-    """A wrong or missing key is found without one;
-    README's is among those that every test run runs."""
+    """Wrong or missing keys are found without a GPU; README's command is among those of every test run."""
     found = [
         c for document in DOCUMENTS for c in check_documents.commands(document) if "trainer=gpu" in c.text
     ]
@@ -259,12 +255,12 @@ def test_a_command_that_fails_is_reported(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("document", check_documents.FAST)
 def test_fast_commands_run(document, tmp_path, monkeypatch):
-    """Commands of the documents that take seconds must run as printed (all of them:
-    `make documents`)."""
+    """Commands that take seconds run as printed (all commands: `make documents`)."""
     run = check_documents.Reader.run
 
     def prepared(reader, text, is_python=False):
-        """A verb or script alone and Python need no shell, and a process that has imported all."""
+        """Run a single verb or script, or Python, in a process that has imported everything, without a
+        shell."""
         if not is_python and (
             not re.match(r"ghgs |python scripts/", text) or re.search(r"[$`|&;<>*\n]", text)
         ):
@@ -277,8 +273,7 @@ def test_fast_commands_run(document, tmp_path, monkeypatch):
     assert check_documents.main(["--fast", document, "--folder", str(tmp_path)]) == 0
 
 
-#: Decibels by which a figure may differ on another processor:
-#: two in the last digit that is printed.
+#: Decibels by which a figure may differ on another processor: two units of the last printed digit.
 ROUNDING = 0.02
 
 
@@ -293,8 +288,10 @@ def figures(document: str) -> dict[tuple[str, str], list[tuple[float, float]]]:
 
 
 def test_figures_of_the_first_day_are_those_of_a_run(tmp_path):
-    """Of what is not trained, measured again on the people that the page holds out; its model's are
-    the same in both tables, and lie as far below a perfect depth as the page says."""
+    """Untrained methods, evaluated again on the people that the page holds out, have the printed figures.
+
+    The page's model has the same figures in both tables, and is as far below perfect depth as stated.
+    """
     page = (REPOSITORY / "docs" / "first_day.md").read_text()
     printed, reader = figures(page), check_documents.Reader(tmp_path, "docs/first_day.md")
     for command in (

@@ -1,4 +1,4 @@
-"""Files that several processes share: whole or absent, and locks that end with their process."""
+"""Files shared by processes: complete or absent, and locks that end with their process."""
 
 import multiprocessing
 import os
@@ -34,8 +34,7 @@ def names(folder) -> list[str]:
 
 
 def test_a_failing_writer_leaves_the_old_file_or_none(tmp_path):
-    """A run that dies in a write must neither lose the last checkpoint nor leave half
-    of a new one."""
+    """A run that dies while writing must neither lose the last checkpoint nor leave half of a new one."""
 
     def fail(temporary):
         temporary.write_text("half")
@@ -53,8 +52,7 @@ def test_a_failing_writer_leaves_the_old_file_or_none(tmp_path):
 
 
 def test_leftovers_of_dead_processes_are_removed_and_no_others(tmp_path):
-    """Killed runs must not fill the disk; a process that is still writing must not
-    lose its file."""
+    """Killed runs must not fill the disk; a process that is still writing must not lose its file."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     host = socket.gethostname()
@@ -71,7 +69,7 @@ def write_often(path, letter):
 
 
 def test_two_processes_write_one_file_and_readers_see_whole_ones(tmp_path):
-    """Two processes of one sweep write the same plan: a reader must never see a mixture."""
+    """Two processes of a sweep write the same plan: a reader must never get a mixture."""
     path = tmp_path / "plan"
     writers = [PREPARED.Process(target=write_often, args=(path, letter)) for letter in "ab"]
     for writer in writers:
@@ -107,7 +105,7 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
     with lock(path, wait=True) as locked:
         assert locked
         assert is_locked(path)
-        with lock(path, wait=True) as again:  # waiting for itself would never end
+        with lock(path, wait=True) as again:  # waiting for itself would not end
             assert not again
         assert is_locked(path)
     holder.join()
@@ -115,8 +113,8 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
 
 
 def write_limited(kind, folder, answers):
-    """In a process of its own: write 4 MB or more where files may have half of one,
-    as on a disk that is full."""
+    """Write 4 MB or more where files are limited to 0.5 MB, as on a full disk; runs in a separate
+    process."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
     numbers = np.zeros(1 << 20, np.float32)
     content = {"weights": torch.from_numpy(numbers)}  # no threads after a fork
@@ -162,13 +160,13 @@ def test_errors_that_name_a_file_keep_it(tmp_path):
 
 
 def test_a_bug_in_the_writer_keeps_its_type(tmp_path):
-    """Only what the system refuses is bad input."""
+    """Only errors of the system are bad input."""
     with pytest.raises(KeyError, match="bug"):
         write_atomically(tmp_path / "x", lambda temporary: {}["bug"])
 
 
 def link(path, content, kind="symlink"):
-    """A link to a file of that content, which lies elsewhere."""
+    """Link to a file with this content, stored elsewhere."""
     target = path.with_name(f"target-of-{path.name}")
     target.write_text(content)
     getattr(path, f"{kind}_to")(target)
@@ -178,7 +176,7 @@ def link(path, content, kind="symlink"):
 @pytest.mark.parametrize("act", [lock, is_locked], ids=["lock", "is_locked"])
 @pytest.mark.parametrize("kind", ["symlink", "hardlink"])
 def test_a_lock_file_that_is_another_file_is_refused_and_stays(tmp_path, kind, act):
-    """Folders of strangers may hold a ``.lock`` that leads to a file of the user."""
+    """Untrusted folders may contain a ``.lock`` that leads to a file of the user."""
     target = link(tmp_path / ".lock", "precious", kind)
     with pytest.raises(InputError, match=r"\.lock: expected a lock file; found .*(link|another file)"):
         act(tmp_path / ".lock").__enter__()
@@ -186,7 +184,7 @@ def test_a_lock_file_that_is_another_file_is_refused_and_stays(tmp_path, kind, a
 
 
 def test_a_lock_whose_file_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
-    """Two processes held it: one the removed file, one the new one."""
+    """Regression: two processes held it, one the removed file and one the new file."""
     path, real = tmp_path / "run" / ".lock", files._try_lock
     removals = [path.unlink, path.parent.rmdir]
 
@@ -202,7 +200,7 @@ def test_a_lock_whose_file_was_removed_meanwhile_is_taken_anew(tmp_path, monkeyp
 
 
 def test_a_lock_is_not_made_where_a_link_leads(tmp_path):
-    """An empty file, or one that does not exist yet, would become a lock."""
+    """An empty or missing target would become a lock."""
     (tmp_path / ".lock").symlink_to(tmp_path / "target")
     for _ in range(2):
         with pytest.raises(InputError, match=r"\.lock: expected a lock file; found 'a link'"):
@@ -268,7 +266,7 @@ def test_no_line_is_appended_through_a_link(tmp_path):
 
 @pytest.mark.parametrize("place", ["train.log", "csv", "csv/metrics.csv"])
 def test_links_in_a_run_are_refused(tmp_path, place):
-    """Lightning and logging open their files in the run's directory as they are."""
+    """Lightning and logging open files in the run's directory without checks."""
     (tmp_path / place).parent.mkdir(exist_ok=True)
     (tmp_path / "checkpoints").symlink_to(tmp_path)
     require_no_links(tmp_path, ("train.log", "csv"))

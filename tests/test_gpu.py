@@ -1,5 +1,5 @@
-"""A GPU computes as the CPU does in float64: ``pytest -m gpu`` there. The CPU in float32 is held to the
-same, which tests this file."""
+"""A GPU computes the same as the CPU in float64: run ``pytest -m gpu`` there. The CPU in float32 must
+meet the same limits, which tests this file."""
 
 from dataclasses import replace
 
@@ -14,18 +14,18 @@ from tests.helpers.scenes import make_batch
 from tests.helpers.splats import relative_error
 
 DEVICES = [torch.device("cpu"), pytest.param(torch.device("cuda"), marks=pytest.mark.gpu)]
-#: Largest relative error of a stage. In float32 it is 1e-6 on a CPU; with another order of summation
-#: another of two equally distant neighbours may be chosen, which moves one token. The other precisions
-#: round every product: 8 times one rounding.
+#: Maximum relative error of a stage. In float32 it is 1e-6 on a CPU; another order of summation may select
+#: the other of two equally distant neighbours, which moves one token. The other precisions round every
+#: product: 8 times one rounding.
 LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0**-8}
-#: Largest relative error of the gradient of all weights, which jumps where rounding moves a unit across 0 or
+#: Maximum relative error of the gradient of all weights, which jumps where rounding moves a unit across 0 or
 #: a token to another neighbour; at least one of three models has no such jump.
 GRADIENT_LIMIT = 1e-2
 SEEDS = range(3)
 
 
 class Results(Watcher):
-    """The last result of each stage, by its name."""
+    """Last result of each stage by name."""
 
     def __init__(self):
         self.results = {}
@@ -40,7 +40,7 @@ def double(batch):
 
 @torch.no_grad()
 def results(predictor, batch):
-    """What the stages give for the subject, by the name of the stage, on the CPU."""
+    """Results of the stages for the subject by name, on the CPU."""
     seen = Results()
     with watched(predictor.model, {name: name for name in ("encoder", "recalibration")}, seen):
         prediction = predictor(batch).to("cpu")
@@ -57,7 +57,7 @@ def results(predictor, batch):
 @pytest.mark.parametrize("precision", LIMITS)
 @pytest.mark.parametrize("device", DEVICES)
 def test_stages_compute_as_a_cpu_in_float64(device, precision):
-    """The first stage that fails is the one to look at."""
+    """The first stage that fails contains the error."""
     if device.type == "cpu" and precision in ("tf32", "float16"):
         pytest.skip("CUDA's alone")
     if precision == "bfloat16" and not has_bfloat16(device):
@@ -67,7 +67,7 @@ def test_stages_compute_as_a_cpu_in_float64(device, precision):
     predictor = Predictor(make_model().eval().to(device), precision=precision)
     found = results(predictor, batch.to(device))
     for stage, value in expected.items():
-        limit = LIMITS["float32" if stage == "bounds" else precision]  # geometry is always float32
+        limit = LIMITS["float32" if stage == "bounds" else precision]  # geometry is always in float32
         assert relative_error(found[stage], value) <= limit, stage
 
 
@@ -82,10 +82,11 @@ def test_a_captured_prediction_is_the_eager_one():
 
 
 def gradient(model, batch):
-    """Gradient by all weights of a number that depends on all attributes [n], in float64 on the CPU."""
+    """Gradient of a number that depends on all attributes with respect to all weights [n], in float64 on
+    the CPU."""
     gaussians = Predictor(model.train())(batch).gaussians
     total = 0.0
-    for name in ATTRIBUTES:  # with weights of both signs: the squares of a unit quaternion add up to 1
+    for name in ATTRIBUTES:  # weights of both signs: the squares of a unit quaternion sum to 1
         values = getattr(gaussians, name).flatten()
         weights = torch.arange(len(values), device=values.device).cos().to(values.dtype)
         total = total + (values * weights).mean()

@@ -1,4 +1,4 @@
-"""The benchmark of a GPU: its sections run in a rehearsal, and none stops the others."""
+"""The GPU benchmark: its sections run in a rehearsal, and a failing one does not stop the others."""
 
 import argparse
 import dataclasses
@@ -31,7 +31,7 @@ def one_thread():
 @pytest.mark.filterwarnings("ignore:CUDA is not available")
 @pytest.mark.parametrize("section", ["machine", "step"])
 def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
-    """Without a GPU, so that no minute on one is lost to a mistake."""
+    """Runs without a GPU, so that no GPU time is lost to mistakes."""
     with rehearsal() as device:
         call = Call(device, Rows(tmp_path / "rows.jsonl"), section, TINY, tmp_path)
         SECTIONS[section](call)
@@ -54,7 +54,7 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
 
 
 class Lossy(OperatorBackend):
-    """Repeats nothing of what an operator does from its ``first`` call on, as if it were not captured."""
+    """Backend whose replays omit an operator from its ``first`` call on, as if it had not been captured."""
 
     def __init__(self, device, operator, first):
         super().__init__(device)
@@ -79,7 +79,7 @@ PLANTED = [(kind, backend) for kind, backends in BACKENDS.items() for backend in
 
 @pytest.mark.parametrize(("kind", "planted"), PLANTED)
 def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch):
-    """One that does nothing, or leaves a single operator out."""
+    """A replay that does nothing or omits a single operator is detected."""
     with rehearsal() as device:
         if planted is not None:
             kept, *options = planted
@@ -106,7 +106,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
 
 
 def test_sections_that_are_named_are_one_run():
-    """So that people are rendered beside all of them."""
+    """So that people are rendered while all of them run."""
     runs = gpu.runs_of(["step", "training", "second"])
     assert list(runs) == ["second", "step_training"]
     assert runs["step_training"] == (["step", "training"], 520)
@@ -114,7 +114,7 @@ def test_sections_that_are_named_are_one_run():
 
 @pytest.fixture
 def session(tmp_path, monkeypatch):
-    """Runs sections whose commands are Python code, and returns the file of findings."""
+    """Run sections whose commands are Python code; returns the rows of results."""
 
     def run(plans, codes):
         monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", codes[name]])
@@ -127,8 +127,7 @@ def session(tmp_path, monkeypatch):
 
 
 def test_a_section_that_fails_or_hangs_stops_no_other(session, tmp_path, monkeypatch, capsys):
-    """Its last lines are reported, what it has found stays,
-    and the tables come from the files alone."""
+    """Its last lines are reported, its results are kept, and tables are made from files alone."""
     line = '{"section": "step", "row": "batch of 8", "ms": 12.5}'
     write = f"open({str(tmp_path / 'first.jsonl')!r}, 'a').write({line + chr(10)!r})"
     codes = {
@@ -153,15 +152,14 @@ def test_a_section_that_fails_or_hangs_stops_no_other(session, tmp_path, monkeyp
 
 
 def test_a_section_whose_needs_failed_is_not_run(session):
-    """gsplat that does not compile is said once for each section,
-    with the compiler's last lines."""
+    """A failed compilation of gsplat is reported once per section, with the compiler's last lines."""
     code = "import sys; sys.exit('nvcc: not found')"
     [row] = session({"step": gpu.Plan(30, ("gsplat",))}, dict.fromkeys(("gsplat", "step"), code))
     assert (row["status"], row["last_lines"]) == ("gsplat failed", ["nvcc: not found"])
 
 
 def test_a_command_that_is_ended_leaves_no_section_behind(session, monkeypatch):
-    """Such as by a limit of time: a GPU is not shared with what goes on."""
+    """For example at a time limit: remaining processes would share the GPU with later ones."""
     started = []
 
     def ended(process, _):

@@ -1,9 +1,9 @@
-"""Gradients of every differentiable function of the package against finite differences, in float64.
+"""Gradients of the package's differentiable functions compared with finite differences, in float64.
 
-Those of unit vectors, chamfer, SSIM, a dense head and the reference renderer are tested beside
-their values (``grep -rl gradcheck tests``), the compiled renderer against the reference. Nothing
-else has a gradient: bounds, photo-consistency, relative depths and lenses are constants of a
-training step, as one test checks.
+Those of unit vectors, Chamfer, SSIM, a dense head and the reference renderer are tested together with
+their values (``grep -rl gradcheck tests``), the compiled renderer against the reference. Nothing else has
+a gradient: bounds, photo-consistency, relative depths and lenses are constant in a training step, which
+one test checks.
 """
 
 from dataclasses import replace
@@ -38,7 +38,7 @@ def values(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) -> 
 
 
 def camera() -> tuple[Tensor, Tensor]:
-    """Intrinsics with a skew and extrinsics of one camera that sees the origin."""
+    """Intrinsics with skew and extrinsics of a camera that faces the origin."""
     intrinsics = torch.tensor([[40.0, 0.7, 15.0], [0, 42, 17], [0, 0, 1]], dtype=torch.float64)
     extrinsics = torch.eye(4, dtype=torch.float64)
     extrinsics[:3, :3] = quaternion_to_matrix(torch.tensor([0.9, 0.2, -0.3, 0.1], dtype=torch.float64))
@@ -64,7 +64,7 @@ def resized(source: Window, target: Window):
 
 WHOLE, PART = Window.whole((4, 5)), Window(Span(1, 4, 4), Span(0, 4, 5))
 TARGET = Window(Span(3, 7, 9), Span(0, 5, 11))
-#: Function and inputs; raw values stay apart from the places where an activation has a corner.
+#: Functions with inputs; raw values keep a distance from kinks of activations.
 FUNCTIONS = {
     "confidence": (confidence_of, (values(6),)),
     **{
@@ -97,14 +97,14 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", list(FUNCTIONS))
 def test_a_gradient_is_that_of_finite_differences(name):
-    """A wrong factor in a gradient slows training down and shows nowhere else."""
+    """A wrong factor in a gradient slows down training and has no other symptom."""
     function, inputs = FUNCTIONS[name]
     assert gradcheck(function, inputs)
 
 
 @pytest.mark.parametrize("similarity", ["none", "log", "product", "product_clamped"])
 def test_the_gradient_of_attention_is_that_of_finite_differences(similarity):
-    """In every use of the similarity."""
+    """For every use of the similarity."""
     torch.manual_seed(0)
     block = SemanticAttention(16, 2, similarity).double()
     index = torch.stack([torch.randperm(6)[:3] for _ in range(6)])
@@ -114,7 +114,7 @@ def test_the_gradient_of_attention_is_that_of_finite_differences(similarity):
 
 @pytest.mark.parametrize("name", ["render_l1", "render_ssim", "chamfer", "depth"])
 def test_the_gradient_of_a_loss_is_that_of_finite_differences(name):
-    """With respect to what the model and the renderer give."""
+    """With respect to the outputs of the model and the renderer."""
     batch = training_batch(size=14)
     masks = batch.masks
     points = values(*masks.shape, 3)
@@ -139,8 +139,7 @@ def test_the_gradient_of_a_loss_is_that_of_finite_differences(name):
 
 
 def test_what_is_constant_in_a_training_step_has_no_gradient():
-    """Bounds, agreement of photographs, relative depths and lenses are inputs of networks,
-    not results."""
+    """Bounds, photo-consistency, relative depths and lenses are inputs of networks."""
     batch = make_batch(views=3, height=28, width=28)
     batch = replace(batch, images=batch.images.clone().requires_grad_())
     near = batch.depths.clone().requires_grad_()
@@ -153,7 +152,7 @@ def test_what_is_constant_in_a_training_step_has_no_gradient():
 
 
 def test_the_gradient_of_relative_bounds_is_that_of_finite_differences():
-    """Where bounds have a gradient, their maps have it, too."""
+    """If bounds have a gradient, so do their maps."""
     masks = torch.ones(1, 1, 3, 4, dtype=torch.bool)
     masks[..., 0, :2] = False
     near, far = values(1, 1, 3, 4, low=1.0, high=2.0), values(1, 1, 3, 4, low=2.0, high=3.0)

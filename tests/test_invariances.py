@@ -1,5 +1,4 @@
-"""What must not change a result beyond rounding: the number of threads,
-and the precision of products."""
+"""Results must not change beyond rounding with the number of threads and the precision of products."""
 
 import pytest
 import torch
@@ -19,7 +18,7 @@ from tests.helpers.scenes import make_batch
 
 @pytest.mark.parametrize("name", ["paper", "recurrent"])
 def test_two_threads_predict_what_one_does(name):
-    """Sums may be taken in another order, nothing else."""
+    """Only the order of summation may differ."""
     model, batch, before = (
         make_model(f"model={name}").eval(),
         make_batch(2, 3, 56, 42),
@@ -68,7 +67,7 @@ def recalibration(g):
 
 
 def sweep(g):
-    """Against images and bounds in bfloat16: half a pixel in bfloat16 is a different colour."""
+    """Compare with images and bounds in bfloat16, where half a pixel is a different colour."""
     batch = make_batch(1, 3, 56, 56)
     bounds = DepthBounds(batch.depths - 0.1, batch.depths + 0.1)
 
@@ -98,9 +97,11 @@ HALF = pytest.mark.skipif("avx512bf16" not in processor_features(), reason="no p
 
 @pytest.mark.parametrize("case", [pytest.param(attention, marks=HALF), recalibration, sweep, similarity])
 def test_mixed_precision_costs_at_most_twice_what_it_costs_pytorch(case):
-    """``|out - ref|`` of the same function in plain PyTorch at that dtype, and 1e-5 of
-    ``|ref|``; root mean squares, since the largest rounding is the luck of a processor's order
-    of summation."""
+    """At most twice ``|out - ref|`` of the same function in plain PyTorch at that dtype, plus 1e-5 of
+    ``|ref|``.
+
+    Root mean squares, because the largest rounding error depends on a processor's order of summation.
+    """
     ours, plain = case(torch.Generator().manual_seed(0))
     expected = plain(torch.float32)
     allowed = 2 * (plain(torch.bfloat16).float() - expected).norm() + 1e-5 * expected.norm()

@@ -1,4 +1,4 @@
-"""What a verb leaves in its process does not reach the next test."""
+"""Changes of a verb to its process do not reach the next test."""
 
 import logging
 import os
@@ -12,7 +12,7 @@ from ghgs_lit.runs import job
 
 
 def test_a_test_may_leave_what_a_verb_does(tmp_path):
-    """As the last commands of tests of sweeps and of training did."""
+    """Leave the changes that tests of sweeps and of training left."""
     os.environ |= {"HYDRA_FULL_ERROR": "1", "PL_GLOBAL_SEED": "1"}
     torch.set_float32_matmul_precision("high")
     assert not job.in_sweep()
@@ -23,8 +23,8 @@ def test_a_test_may_leave_what_a_verb_does(tmp_path):
 
 
 def test_the_next_test_does_not_find_it():
-    """Products were rounded, errors had tracebacks, lines went to files of another test, and whether
-    a job was one of a sweep depended on the order of tests."""
+    """Regression: products were rounded, errors had tracebacks, logs went to files of another test, and
+    whether a job was part of a sweep depended on the order of tests."""
     assert not job.in_sweep()
     assert not {"HYDRA_FULL_ERROR", "PL_GLOBAL_SEED"} & os.environ.keys()
     assert torch.get_float32_matmul_precision() == "highest"

@@ -1,10 +1,10 @@
-"""What a GPU is asked for may not grow: launches, and waits of the host,
-counted on the pretend device.
+"""Launches and synchronizations of a GPU, counted on the pretend device, must not increase.
 
-Operators of the package (:mod:`ghgs_lit.ops.dispatch`) are one launch, as on CUDA. Counts are exact
-and the same on every machine; each limit is the count of today. Whoever needs fewer lowers it: a
-failing test prints the line to write. Other versions of PyTorch may divide an operator otherwise,
-so that they are held to waits alone."""
+Operators of the package (:mod:`ghgs_lit.ops.dispatch`) count as one launch, as on CUDA. Counts are exact
+and the same on every machine; each limit is the current count. If you reduce a count, lower its limit: a
+failing test prints the line to write. Other versions of PyTorch may divide operators differently, so only
+synchronizations are limited for them.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from tests.helpers.pretend_device import DEVICE, pretend_device
 
 
 class Asked(NamedTuple):
-    """Of a prediction, and of a training step with two rounds where there are any."""
+    """Counts of a prediction, and of a training step with two rounds if the model has rounds."""
 
     launches: int
     waits: int
@@ -37,7 +37,7 @@ class Asked(NamedTuple):
     step_waits: int
 
 
-#: Of PyTorch, whose launches are counted.
+#: Version of PyTorch whose launches are limited.
 _VERSION = "2.13."
 
 LIMITS = {
@@ -61,7 +61,7 @@ def one_thread():
 
 
 def two_rounds(kind: str) -> GHGS:
-    """A model whose training steps have two rounds where there are any."""
+    """Model whose training steps have two rounds if it has rounds."""
     model = load_model() if kind == "shipped" else make_model(kind)
     if model.rounds.height is not None or kind == "model=recurrent":
         model.rounds.options = model.rounds.options.replace(training_counts=(2,))
@@ -69,14 +69,13 @@ def two_rounds(kind: str) -> GHGS:
 
 
 def asked(kind: str, size: int) -> Asked:
-    """Counts for four views of 28 x 28 pixels,
-    or 56 x 56 with the weights that come with the package."""
+    """Counts for four views of 28 x 28 pixels, or 56 x 56 with the weights that come with the package."""
     model = two_rounds(kind)
     batch = ellipsoid_batch(0.15, 4, 28, size)
     batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=2.0 * batch.masks)
     with pretend_device() as log, device.drawing_nothing():
         model, batch = model.to(DEVICE), batch.to(DEVICE)
-        for _ in range(2):  # the first fills caches, which depend on the size of photographs alone
+        for _ in range(2):  # the first fills caches, which depend only on the image size
             log.clear()
             _, launches, waits = device.forward(Predictor(model.eval()), batch, log)["total"]
         parts = device.second_step(model.train(), Optimization(lr=1e-3, matrix_scale=1.0), batch, log)
@@ -86,8 +85,8 @@ def asked(kind: str, size: int) -> Asked:
 
 @pytest.mark.parametrize(("kind", "size"), LIMITS)
 def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
-    """Each launch costs the host some 15 microseconds,
-    each wait the time until the GPU has caught up."""
+    """Each launch costs the host some 15 microseconds, each synchronization the time until the GPU has
+    caught up."""
     found, limit = asked(kind, size), LIMITS[kind, size]
     counted = Asked._fields if torch.__version__.startswith(_VERSION) else ("waits", "step_waits")
     grown = [name for name in counted if getattr(found, name) > getattr(limit, name)]
@@ -95,7 +94,7 @@ def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
     assert not grown
 
 
-#: Launches around the graphs of a training step, and waits, by the model and the batch's size.
+#: Launches outside the graphs of a training step, and synchronizations, by model and batch size.
 AROUND = {
     ("shipped", 1): (30, 2),
     ("shipped", 8): (30, 2),
@@ -106,8 +105,8 @@ AROUND = {
 
 @pytest.mark.parametrize(("kind", "size"), AROUND)
 def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
-    """Data, plan, copies, the pass of gradients to weights, and clipping; with the Chamfer term
-    of the paper's loss where the model is the paper's."""
+    """Data, plan, copies, the backward pass to weights, and clipping; with the Chamfer term for the
+    paper's model."""
     batch = ellipsoid_batch(0.15, 4, 28, size)
     bodies = [torch.linspace(-0.3, 0.3, 3 * 40).view(40, 3)] * size
     weights = {"chamfer": 1.0} if kind == "model=paper" else {"depth": 0.2}
@@ -134,14 +133,15 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
     assert all(found[number] <= AROUND[kind, size][number] for number in counted)
 
 
-#: Launches around the graphs of a prediction of the shipped weights, and waits, by the batch's size.
+#: Launches outside the graphs of a prediction of the shipped weights, and synchronizations, by batch size.
 PREDICTED = {1: (17, 2), 8: (45, 2)}
 
 
 @pytest.mark.parametrize("size", PREDICTED)
 @torch.no_grad()
 def test_little_is_asked_for_around_a_prediction_that_is_played_back(size):
-    """Copies of inputs and results, the plan, the room of renderings, and what cuts results to size."""
+    """Copies of inputs and results, the plan, buffers of renderings, and slicing of results to their
+    size."""
     batch = dataclasses.replace(ellipsoid_batch(0.15, 4, 28, size), targets=None)
     with pretend_device() as log, device.drawing_nothing():
         predictor = Predictor.from_checkpoint(map_location=DEVICE)

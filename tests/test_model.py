@@ -1,4 +1,4 @@
-"""The whole model: numbers of the release, invariances, skipping, refusals."""
+"""The whole model: numbers of the release, invariances, skipping and rejected configurations."""
 
 import operator
 import subprocess
@@ -68,14 +68,13 @@ def release_model(inputs, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_pipeline_matches_the_release(dtype):
-    """The whole pipeline must reproduce the numbers of the authors' code."""
+    """The whole pipeline reproduces the numbers of the authors' code."""
     name = "predict_gaussian_reduced"
     inputs, expected = fixture(name, "in", dtype), fixture(name, "out64", torch.float64)
     extrinsics = torch.eye(4, dtype=dtype).repeat(1, 3, 1, 1)
     extrinsics[..., :3, :] = inputs["extr"]
     masks = inputs["mask"][:, :, 0] != 0
-    # The photographs are 64 x 64; the release pads them to 70 x 70 before,
-    # the model does so itself.
+    # The images are 64 x 64; the release pads them to 70 x 70 beforehand, this model by itself.
     batch = Batch(inputs["image"][..., 3:-3, 3:-3], masks, Cameras(inputs["intr"], extrinsics, 64, 64))
     model = release_model(inputs, dtype)
     prediction = Predictor(model, ModelOptions(pad="multiple", frame="world"))(batch)
@@ -107,15 +106,15 @@ def test_the_pipeline_matches_the_release(dtype):
     [
         ("model=paper", "exact", torch.float32, 1e-5),
         *(("model=hull", skip, torch.float32, 1e-5) for skip in PRESETS),
-        # Its depth is 1/d of a d that crosses 0 where the subject fills a view: |depth| goes from
-        # 2 to 1000, and rounding grows as much (3e-5 in float32 on some processors). In float64 it
-        # is below 1e-12.
+        # Its depth is 1/d with d crossing 0 where the subject fills a view: |depth| ranges from 2 to 1000,
+        # and rounding errors grow as much (3e-5 in float32 on some processors). In float64 they are below
+        # 1e-12.
         ("compat=release", "none", torch.float64, 1e-9),
     ],
     ids=lambda value: str(value).removeprefix("torch."),
 )
 def test_a_batch_equals_its_elements_one_by_one(kind, skip, dtype, limit):
-    """A result must not depend on the other subjects of its batch."""
+    """Results must not depend on the other subjects of the batch."""
     singles = [in_dtype(batch, dtype) for batch in hard_subjects().values()]
     model = make_model(kind, f"skip={skip}").eval().to(dtype)
     with torch.no_grad():
@@ -140,8 +139,7 @@ def test_a_batch_equals_its_elements_one_by_one(kind, skip, dtype, limit):
 @pytest.mark.parametrize("skip", PRESETS)
 @pytest.mark.parametrize("name", list(hard_subjects()))
 def test_extreme_masks_give_one_finite_gaussian_for_each_pixel(name, skip):
-    """Empty, full and single-pixel masks, two people, a subject at the border:
-    nothing is lost or NaN."""
+    """Empty, full and single-pixel masks, two people, a subject at the border: nothing is lost or NaN."""
     batch = hard_subjects()[name]
     with torch.no_grad():
         prediction = predict(make_model(f"skip={skip}"), batch)
@@ -178,7 +176,7 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
 
 
 def test_ablations_differ_and_say_what_they_leave_out():
-    """An ablation that changes nothing would make a wrong table."""
+    """An ablation without effect would make a wrong table."""
     batch = make_batch(1, 3)
     outputs = {}
     for name in ("full", "no_unprojection", "no_semantic", "neither"):
@@ -193,7 +191,7 @@ def test_ablations_differ_and_say_what_they_leave_out():
 
 
 def test_an_ablation_wins_over_the_releases_values():
-    """Ablations of the release's model must take effect."""
+    """Ablations of the release's model take effect."""
     cfg = config("compat=release", "ablation=no_semantic")
     assert cfg["recalibration"]["similarity"] == "none"
     assert cfg["recalibration"]["tokens"] == "all"
@@ -201,7 +199,7 @@ def test_an_ablation_wins_over_the_releases_values():
 
 
 def test_named_models_choose_their_parts_and_the_command_line_wins():
-    """What is written on the command line must be what one gets."""
+    """Values on the command line take precedence."""
     assert config("model=hull")["bounds"]["kind"] == "hull"
     assert config("model=paper")["bounds"]["kind"] == "box"
     assert config("model=paper", "bounds.kind=hull")["bounds"]["kind"] == "hull"
@@ -211,12 +209,12 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
 
 @pytest.mark.parametrize(("skip", "ablation"), [*((skip, "full") for skip in PRESETS), ("exact", "neither")])
 def test_order_of_later_views_does_not_matter(skip, ablation):
-    """The order of the later views must not change the Gaussians (the encoder treats the
-    first apart)."""
+    """The order of all views but the first, which the encoder treats differently, must not change the
+    Gaussians."""
     batch = make_batch(1, 4, zoom=0.6)
     order = torch.tensor([0, 3, 1, 2])
     swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])
-    # On the image plane ties at the last distance are broken by the order of views: leave none out.
+    # On the image plane the order of views breaks ties at the largest distance: keep all neighbours.
     model = make_model(f"skip={skip}", f"ablation={ablation}", "recalibration.k=1000").double()
     with torch.no_grad():
         a, b = (predict(model, in_dtype(x, torch.float64)).gaussians for x in (batch, swapped))
@@ -225,7 +223,7 @@ def test_order_of_later_views_does_not_matter(skip, ablation):
 
 
 def test_a_missing_stage_and_a_bad_value_name_their_key():
-    """Errors of a configuration must start with the key."""
+    """Configuration errors start with the key."""
     with pytest.raises(InputError, match="gaussian_head: expected a stage"):
         GHGS.from_config({k: v for k, v in config().items() if k != "gaussian_head"})
     with pytest.raises(InputError, match=r"depth_head\.parameterization: expected one of bounded_inverse"):
@@ -250,13 +248,13 @@ def test_a_missing_stage_and_a_bad_value_name_their_key():
     ],
 )
 def test_bounds_that_do_not_fit_the_depths_are_refused(overrides, found):
-    """Depths between bounds that nobody computes would fail in the first forward pass only."""
+    """Missing bounds would otherwise fail in the first forward pass."""
     with pytest.raises(InputError, match=found):
         GHGS.from_config(config(*overrides))
 
 
 def test_an_unknown_precision_is_refused_when_it_is_set():
-    """A typing error must not wait for the first forward pass."""
+    """A typing error is reported before the first forward pass."""
     model = make_model("model=paper")
     with pytest.raises(InputError, match="precision: expected one of inherit"):
         Predictor(model, precision="half")

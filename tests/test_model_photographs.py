@@ -1,4 +1,4 @@
-"""The whole model on photographs of any size, and with soft mattes."""
+"""The whole model on images of any size, and with soft mattes."""
 
 import dataclasses
 
@@ -21,8 +21,7 @@ PADS = ["model.pad=multiple"]
 @pytest.mark.parametrize("skip", ["none", "exact", "balanced", "fast"])
 @pytest.mark.parametrize(("size", "name"), [((50, 64), "hull"), ((45, 71), "paper")])
 def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
-    """What the stages see is a batch with a black border;
-    what comes back is in the photograph's pixels."""
+    """Stages receive a batch with a black border; results are in pixels of the original images."""
     batch = make_batch(2, 3, *size)
     overrides = [f"model={name}", f"skip={skip}"]
     with pytest.raises(InputError, match=r"model\.pad=multiple"):
@@ -37,7 +36,7 @@ def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
     assert torch.equal(gaussians.pixel, pixel)
     colors = batch.images.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
     assert torch.equal(gaussians.colors, colors)
-    # Points lie on the rays of their pixels, with the photographs' own cameras.
+    # Points lie on the rays of their pixels, with the cameras of the original images.
     matrices = (m[:, :, None, None] for m in (batch.cameras.intrinsics, batch.cameras.extrinsics))
     uv, z = project(found.points.pixels, *matrices)
     centers = pixel_centers(*size, uv).expand_as(uv)
@@ -46,14 +45,14 @@ def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
 
 
 def test_padding_is_what_a_black_border_does_by_hand():
-    """model.pad must give exactly what a padded photograph gives."""
+    """model.pad gives exactly the result for manually padded images."""
     batch = make_batch(1, 3, 50, 64)
     border = nn.functional.pad(batch.images, (3, 3, 3, 3))
     masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))
     by_hand = Batch(border, masks, batch.cameras.cropped(-3, -3, 56, 70))
     model = make_model("model=paper", *PADS)
     found = predict(model, batch)
-    # The box is carved from the photographs: a border would say that nothing lies beyond them.
+    # The box is carved from the unpadded images: with a border, nothing would lie outside them.
     bounds = model.bounds(Frame.of(batch).enter(batch))
     near, far = (nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in (bounds.near, bounds.far))
     model.bounds = lambda _: DepthBounds(near, far)
@@ -66,7 +65,7 @@ def test_padding_is_what_a_black_border_does_by_hand():
 
 
 def test_without_the_option_mattes_are_ignored():
-    """model=paper knows masks alone."""
+    """model=paper reads only masks."""
     soft = with_soft_rims(make_batch())
     model = make_model("model=paper").eval()
     found, expected = (predict(model, b).gaussians for b in (soft, dataclasses.replace(soft, alpha=None)))
@@ -76,7 +75,7 @@ def test_without_the_option_mattes_are_ignored():
 
 @pytest.mark.parametrize("kind", ["hull", "recurrent"])
 def test_pixels_that_show_a_part_of_the_subject_become_gaussians(kind):
-    """With their share in the opacity; skip=exact changes nothing, nor do batch mates."""
+    """Their share limits the opacity; skip=exact and other batch elements change nothing."""
     both = with_soft_rims(make_batch(2, 3))
     options = (f"model={kind}", "model.matte=0.125")
     model = make_model(*options).eval()
@@ -100,7 +99,7 @@ def test_pixels_that_show_a_part_of_the_subject_become_gaussians(kind):
 
 
 def test_photographs_of_any_size_keep_their_mattes():
-    """The black border of model.pad=multiple is no part of the subject."""
+    """The black border of model.pad=multiple is not part of the subject."""
     soft = with_soft_rims(make_batch(1, 2, 50, 60))
     gaussians = predict(
         make_model("model=hull", "model.matte=0.125", "model.pad=multiple").eval(), soft
@@ -110,7 +109,7 @@ def test_photographs_of_any_size_keep_their_mattes():
 
 
 def test_an_impossible_matte_is_refused():
-    """More than a half would leave pixels of the mask without Gaussians."""
+    """Above 0.5, pixels of the mask would lack Gaussians."""
     with pytest.raises(
         InputError, match=r"model\.matte: expected a number >= 0 and <= 0\.5 or null; found 0\.7"
     ):

@@ -1,4 +1,4 @@
-"""What the model skips: the same Gaussians of the same pixels, by less work."""
+"""Work that the model skips: the same Gaussians of the same pixels at lower cost."""
 
 import dataclasses
 import operator
@@ -19,7 +19,7 @@ def element(batch, b):
 
 
 def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background():
-    """The preset changes what the encoder sees, and nothing else."""
+    """The preset changes only the tokens of the encoder."""
     batch = make_batch(2, 3)
     batch = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
     with torch.no_grad():
@@ -30,8 +30,8 @@ def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background
 @pytest.mark.parametrize("margin", [0, 1])
 @torch.no_grad()
 def test_skip_fast_with_few_pixels_and_with_mates(margin):
-    """An empty view, a single pixel, two people and a batch mate: the same pixels,
-    each element as alone."""
+    """An empty view, a single pixel, two people and a second element: same pixels, and each element as if
+    alone."""
     batch = make_batch(2, 4, zoom=0.4)
     batch.masks[0, 0] = False
     batch.masks[0, 1] = False
@@ -49,7 +49,7 @@ def test_skip_fast_with_few_pixels_and_with_mates(margin):
 
 
 def test_only_windows_around_the_subject_are_decoded():
-    """skip=exact must skip the work, except where all tokens need a depth."""
+    """skip=exact skips this work, except where all tokens require a depth."""
     batch = make_batch(2, 3, zoom=0.4)
     batch.masks[1, 0] = False
     model = make_model("skip=exact")
@@ -71,8 +71,7 @@ def test_only_windows_around_the_subject_are_decoded():
 )
 @pytest.mark.parametrize("size", [(70, 70), (154, 98)])
 def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
-    """skip=exact promises the same Gaussians,
-    also where windows are smaller than the photographs."""
+    """skip=exact promises the same Gaussians, also where windows are smaller than the images."""
     batch = make_batch(2, 3, *size, zoom=0.3)
     batch.masks[0, 1] = False
     batch.masks[1, 2, :5, -9:] = True
@@ -85,7 +84,7 @@ def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
 
 @pytest.mark.parametrize("size", [(56, 56), (42, 70)])
 def test_tokens_of_windows_give_gaussians_of_the_same_pixels(size):
-    """The encoder sees less background, the geometry is that of the whole photographs."""
+    """The encoder receives less background; the geometry is that of the whole images."""
     batch = make_batch(2, 3, *size, zoom=0.5)
     whole, part = (predict(make_model(f"skip={name}"), batch) for name in ("exact", "balanced"))
     assert len(part.points.tokens) < len(whole.points.tokens)
@@ -97,7 +96,7 @@ def test_tokens_of_windows_give_gaussians_of_the_same_pixels(size):
     for name in ("near", "far"):
         near = (getattr(prediction.depth_maps.bounds, name)[batch.masks] for prediction in (part, whole))
         assert torch.equal(*near)
-    # Points lie on the rays of their pixels in the whole photograph.
+    # Points lie on the rays of their pixels in the whole image.
     camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
     uv, _ = project(
         part.points.pixels,

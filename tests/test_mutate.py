@@ -1,4 +1,4 @@
-"""Mutants are changes of one place, and tests that fail kill them."""
+"""Mutants are changes in one place, killed by failing tests."""
 
 import json
 import runpy
@@ -15,7 +15,7 @@ CASES = [
 
 @pytest.mark.parametrize(("code", "changed"), CASES)
 def test_one_place_is_changed(code, changed, tmp_path, monkeypatch):
-    """The first mutant of a statement; the text around it stays."""
+    """The first mutant of a statement; the surrounding text stays."""
     monkeypatch.setitem(mutate["mutants_of"].__globals__, "ROOT", tmp_path)
     line = code if code.startswith("raise") else f"y = {code}  # é"
     (tmp_path / "a.py").write_text(f"'''Text.'''\n{line}\n")
@@ -26,7 +26,7 @@ def test_one_place_is_changed(code, changed, tmp_path, monkeypatch):
 
 
 def test_a_test_that_fails_kills(tmp_path):
-    """One test sees the change, another runs the line and asserts nothing."""
+    """One test detects the change, another runs the line without assertions."""
     (tmp_path / "own.py").write_text("def add(a, b):\n    return a + b\n")
     tests = ["from own import add", "def test_sees(): assert add(1, 2) == 3", "def test_blind(): add(1, 2)"]
     (tmp_path / "test_own.py").write_text("\n".join(tests))

@@ -1,11 +1,11 @@
-"""Names of files as other systems spell them, by the one reader that captures,
-data sets and scans share."""
+"""File names as spelled by other systems, found by the one function that captures, data sets and scans
+share."""
 
 import pytest
 
 from ghgs_lit.parsing import find_path, parts_of
 
-#: The file that lies there, what a file or a user says, the endings that count.
+#: Stored file, name given by a file or user, accepted suffixes.
 SPELLINGS = [
     ("masks/cam0.png", "masks/cam0.png", ("",)),
     ("masks/cam0.png", "masks\\cam0.png", ("",)),
@@ -30,8 +30,8 @@ def test_a_file_is_found_under_every_spelling(tmp_path, stored, said, suffixes):
 
 
 def test_the_nearest_spelling_counts(tmp_path):
-    """The exact one first, the preferred ending before others,
-    and never one of several by case alone."""
+    """The exact spelling first, the preferred suffix before others, and never one of several that differ
+    only in case."""
     for name in ("a.PNG", "A.png", "b.png", "b.jpg", "C.png", "c.PNG", "D.png", "d.pNG", "d.PNG"):
         (tmp_path / name).touch()
     assert find_path(tmp_path, "a", (".png",)).name == "a.PNG"
@@ -44,7 +44,7 @@ def test_the_nearest_spelling_counts(tmp_path):
 
 
 def test_a_file_that_arrives_later_is_found(tmp_path):
-    """What is listed is listed anew when the folder changes."""
+    """The folder is listed again when it changes."""
     assert find_path(tmp_path, "a", (".png",)) is None
     (tmp_path / "a.PNG").touch()
     assert find_path(tmp_path, "a", (".png",)).name == "a.PNG"

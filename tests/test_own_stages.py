@@ -1,4 +1,4 @@
-"""A stage of one's own in the place of each of the model's: trained, saved, loaded and measured."""
+"""A user-defined stage in place of each stage of the model: trained, saved, loaded and evaluated."""
 
 import json
 import shutil
@@ -24,15 +24,15 @@ FILE = Path(__file__).parent / "fixtures" / "own_stages.py"
 GROUPS = (
     "bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head", "renderer", "loss"
 )  # fmt: skip
-#: What verbs need to be told again: a checkpoint brings its model.
+#: Overrides to repeat for every verb; the model itself comes from the checkpoint.
 SAID = {"renderer": ["renderer.kind=mine"], "loss": ["metrics=mine"]}
-#: Stages that are chosen by their kind; the others by a YAML.
+#: Stages chosen by their kind; the others are chosen by a YAML file.
 KINDS = {"bounds", "depth_head", "unprojection", "recalibration", "gaussian_head", "renderer"}
 
 
 @pytest.fixture(scope="module")
 def boxes(tmp_path_factory):
-    """Rendered boxes, one to train with and one to measure."""
+    """Rendered boxes, one for training and one for evaluation."""
     folder = tmp_path_factory.mktemp("boxes")
     render_boxes(folder / "rendered", folder / "scans", train=1, val=1)
     return folder / "rendered"
@@ -40,7 +40,7 @@ def boxes(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory):
-    """Four photographs of somebody, with their cameras."""
+    """Four photographs of a figure, with their cameras."""
     folder = tmp_path_factory.mktemp("photographs")
     Figure().write(folder)
     return [f"images={folder}", f"cameras={folder / 'cameras.json'}"]
@@ -48,7 +48,7 @@ def photographs(tmp_path_factory):
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
-    """A user's folder: a Python file of stages, and a YAML for each of them."""
+    """A user's folder: a Python file with stages, and a YAML file for each of them."""
     shutil.copy(FILE, tmp_path / "own_stages.py")
     for group in {*GROUPS, "metrics"} - KINDS:
         (tmp_path / "conf" / group).mkdir(parents=True)
@@ -72,9 +72,9 @@ def test_an_attribute_that_a_stage_lacks_is_named(project):
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypatch, group):
-    """Nothing else of a stage is used than what its protocol says (:mod:`ghgs_lit.method.stages`).
+    """Only the parts of a stage that its protocol describes are used (:mod:`ghgs_lit.method.stages`).
 
-    Weights of a loss are the checkpoint's, too; numbers of a metric are written like all others.
+    The checkpoint also contains the weights of a loss; values of a metric are written like all others.
     """
     said = ["--config-dir", "conf", *SAID.get(group, [])]
     chosen = f"{group}.kind=mine" if group in KINDS else f"{group}=mine"
@@ -100,7 +100,7 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     assert values[1] == pytest.approx(values[0], abs=1e-3)
     if group == "loss":
         saved = torch.load(checkpoint)["state_dict"]
-        assert saved["losses.log_variance"] != 0  # as it began
+        assert saved["losses.log_variance"] != 0  # differs from its initial value
         read = GHGSModule.load_from_checkpoint(checkpoint).losses.state_dict()
         assert all(torch.equal(value, saved[f"losses.{name}"]) for name, value in read.items())
         assert "largest" in measured["provenance"]["protocol"]["reported"]

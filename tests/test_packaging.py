@@ -30,7 +30,7 @@ def groups(conf: Path) -> set[str]:
 
 
 def test_wheel_carries_the_configuration_and_assets(tmp_path):
-    """A wheel without ``conf`` or the body model would fail on first use."""
+    """A wheel without ``conf`` or the body model would fail at first use."""
     pytest.importorskip("hatchling")
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path / "dist")],
@@ -54,19 +54,19 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
 
 
 def test_editable_install(tmp_path):
-    """Developers must get the checkout's ``conf``, not an installed copy."""
+    """Developers get the checkout's ``conf`` rather than an installed copy."""
     assert found_conf(tmp_path, None) == REPOSITORY / "conf"
 
 
 def test_checkout(tmp_path):
-    """The package must run from a copy of the repository that is not installed."""
+    """The package runs from a copy of the repository that is not installed."""
     for name in ("ghgs_lit", "conf"):
         shutil.copytree(REPOSITORY / name, tmp_path / "copy" / name)
     assert found_conf(tmp_path, tmp_path / "copy") == (tmp_path / "copy" / "conf").resolve()
 
 
 def required() -> dict[str, Requirement]:
-    """Every requirement of the package and of its extras, by name."""
+    """Requirements of the package and its extras, by name."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     lines = [
         *project["dependencies"],
@@ -76,7 +76,7 @@ def required() -> dict[str, Requirement]:
 
 
 def test_the_versions_that_make_installs_are_allowed():
-    """``constraints.txt`` must not contradict what pip may choose."""
+    """``constraints.txt`` must not contradict the version ranges of the package."""
     lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
     exact = dict(line.split("==") for line in lines if not line.startswith("#"))
     known = {name.replace("_", "-"): each for name, each in required().items()}
@@ -89,6 +89,6 @@ def test_the_versions_that_make_installs_are_allowed():
     ("name", "unsafe", "safe"), [("torch", "2.5.1", "2.6.0"), ("hydra-core", "1.3.5", "1.3.6")]
 )
 def test_versions_that_run_what_a_file_says_are_refused(name, unsafe, safe):
-    """Older ones unpickle code by default, or call whatever a configuration of logging names."""
+    """Older versions unpickle code by default, or call any function named in a logging configuration."""
     assert not required()[name].specifier.contains(unsafe)
     assert required()[name].specifier.contains(safe)

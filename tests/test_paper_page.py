@@ -1,4 +1,4 @@
-"""The page about `model=paper` prints the figures of the code."""
+"""The page about `model=paper` shows the values of the code."""
 
 from pathlib import Path
 

@@ -1,4 +1,5 @@
-"""Files that are broken, foreign or without end: one line that names them, in no time."""
+"""Files that are broken, foreign or endless are rejected at once, with a one-line message that contains
+their path."""
 
 import contextlib
 import itertools
@@ -28,7 +29,7 @@ def large(path):
     os.truncate(path, LARGEST + 1)
 
 
-#: What no reader takes, by name: makes the file.
+#: Creates a path that no reader accepts, by name.
 NO_FILES = {
     "missing": lambda path: None,
     "a folder": Path.mkdir,
@@ -131,7 +132,7 @@ FOREIGN = (b"\xff\xfe", b'{"a":', b"5", b"[5]", b'{"train": 5}', b'{"train": [[1
 
 
 def test_foreign_content_of_files_of_this_program(tmp_path):
-    """Plans, settings, split lists and results that something else wrote are named."""
+    """Errors for foreign plans, settings, split lists and results contain the path."""
     folder = tmp_path / "rendering"
     folder.mkdir()
     readers = {

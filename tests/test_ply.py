@@ -1,4 +1,4 @@
-"""Splats on disk."""
+"""Gaussians saved as PLY files."""
 
 import dataclasses
 
@@ -26,8 +26,8 @@ def gaussians(n=50, seed=0) -> Gaussians:
 
 
 def test_a_ply_renders_as_what_was_written(tmp_path):
-    """Opacities, scales, colours and the world frame survive the file:
-    both render to the same image."""
+    """Opacities, scales, colours and the world frame survive the round trip: both render to the same
+    image."""
     written = gaussians()
     write_ply(written, tmp_path / "a.ply")
     read = read_ply(tmp_path / "a.ply")
@@ -41,7 +41,8 @@ def test_a_ply_renders_as_what_was_written(tmp_path):
 
 
 def test_the_viewer_of_3d_gaussian_splatting_reads_it(tmp_path):
-    """As SIBR's ``GaussianView.cpp``: the third line has the count, then come records of degree 0."""
+    """As in SIBR's ``GaussianView.cpp``: the third line contains the count, followed by records of degree
+    0."""
     written = gaussians()
     write_ply(written, tmp_path / "a.ply")
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -76,8 +77,7 @@ def test_a_header_that_promises_terabytes(tmp_path, kind, count, rows):
 
 
 def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
-    """Viewers of 3D Gaussian Splatting read the columns by name;
-    empty and bad files are handled."""
+    """Viewers of 3D Gaussian Splatting read columns by name; empty and invalid files are handled."""
     plyfile = pytest.importorskip("plyfile")
     one = Gaussians(
         torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[2.0, 0, 0, 0]]), torch.tensor([[0.1, 1.0, 0.0]]),
@@ -106,7 +106,7 @@ def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
 
 @pytest.mark.parametrize(("low_pass", "antialiased"), [(0.1, True), (0.3, False), (0.0, False)])
 def test_a_ply_says_which_image_its_gaussians_were_made_for(tmp_path, low_pass, antialiased):
-    """Without it the shipped model's inputs are met by 28 dB instead of 40 dB."""
+    """Without it, the shipped model reproduces its input views with 28 dB instead of 40 dB."""
     written = dataclasses.replace(gaussians(), low_pass=low_pass, antialiased=antialiased)
     write_ply(written, tmp_path / "a.ply")
     read = read_ply(tmp_path / "a.ply")
@@ -127,7 +127,7 @@ def test_a_ply_of_another_program_is_for_the_renderer_of_3dgs(tmp_path):
 
 
 def test_a_comment_at_the_head_counts_as_well(tmp_path):
-    """There earlier versions wrote it, and other programs move comments there."""
+    """Earlier versions wrote it there, and other programs move comments there."""
     plyfile = pytest.importorskip("plyfile")
     write_ply(gaussians(), tmp_path / "a.ply")
     element = plyfile.PlyElement.describe(plyfile.PlyData.read(tmp_path / "a.ply")["vertex"].data, "vertex")

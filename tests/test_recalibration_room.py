@@ -1,4 +1,4 @@
-"""``benchmarks/recalibration_room.py``: rows differ in what their names say."""
+"""``benchmarks/recalibration_room.py``: rows differ as their names describe."""
 
 import itertools
 from dataclasses import replace
@@ -24,7 +24,7 @@ def person():
 
 
 def test_errors_are_planted_by_part_and_view(person):
-    """Between 5 and 15 cm, one value for each part of a view."""
+    """Between 5 and 15 cm, one value for each part in a view."""
     scene = room.plant(person, np.random.default_rng(0))
     errors = (scene.depth_maps.depth - person.batch.depths)[0]
     masks = person.batch.masks[0]
@@ -50,7 +50,7 @@ def test_each_row_trains_and_differs(person, capsys):
 
 
 def test_shares_are_those_of_the_ceiling(capsys):
-    """Rows that differ from the next by as much; only seeds that all rows have count."""
+    """Consecutive rows differ by the same amount; only seeds common to all rows count."""
     results = [{"row": "none", "seed": 2, "surface_mm": [0.0, 0.0], "psnr": [0.0, 0.0]}]
     for number, row in enumerate(room.ROWS):
         values = {"surface_mm": [100.0 - number, 90.0 - number], "psnr": [20.0 + number, 21.0 + number]}

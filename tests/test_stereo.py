@@ -1,4 +1,4 @@
-"""The depth head in ``examples/stereo``, and the peers that tables compare the paper's model with."""
+"""The depth head in ``examples/stereo``, and the models that tables compare with the paper's."""
 
 import dataclasses
 import json
@@ -43,7 +43,7 @@ def stereo(monkeypatch):
 
 
 def peer(name):
-    """A small one that has left its initial state, in which depths are constant."""
+    """A small model moved away from its initial state, in which depths are constant."""
     searched = f"hydra.searchpath=[file://{FOLDER / 'conf'}]"
     config = OmegaConf.masked_copy(compose("train", [searched, f"model={name}", *SMALL]), [*STAGES, "model"])
     torch.manual_seed(0)
@@ -55,7 +55,7 @@ def peer(name):
 
 
 def painted(count, size):
-    """Features of cells that a random function of the place on an ellipsoid paints, cameras,
+    """Features of cells, a random function of the position on an ellipsoid; with cameras, whole cells and
     true depths."""
     cameras = ring(1, count, size, size)
     masks, depths = ellipsoid(cameras)
@@ -75,8 +75,8 @@ def limits(depth, whole):
 
 
 def test_correlations_are_those_of_a_literal_loop(stereo):
-    """Matrices of NumPy and SciPy's interpolation, in float64, cell by cell;
-    5 cameras have 2 neighbours."""
+    """NumPy matrices and SciPy's interpolation in float64, cell by cell; each of 5 cameras has 2
+    neighbours."""
     features, cameras, whole, depth = painted(5, 56)
     near, far = limits(depth, whole)
     cells = whole.flatten().nonzero()[::7, 0]
@@ -101,8 +101,8 @@ def test_correlations_are_those_of_a_literal_loop(stereo):
 
 
 def test_upsampled_maps_are_convex_combinations(stereo):
-    """With all weight on the own cell it is repeated;
-    with equal weights it is the mean of 3 x 3."""
+    """With all weight on its own, a cell is repeated; with equal weights the result is the mean of 3 x 3
+    cells."""
     maps = torch.rand(2, 1, 3, 5)
     weights = torch.zeros(2, 9, 16, 3, 5)
     weights[:, 4] = 1e4
@@ -114,7 +114,8 @@ def test_upsampled_maps_are_convex_combinations(stereo):
 
 
 def test_gradients_are_those_of_finite_differences(stereo):
-    """Of correlations by the features, of an update by all that it sees, of upsampling by both."""
+    """Of correlations with respect to features, of an update and of upsampling with respect to all
+    inputs."""
     torch.manual_seed(3)
     features, cameras, whole, depth = painted(2, 40)
     near, far = (bound.double() for bound in limits(depth, whole))
@@ -133,7 +134,7 @@ def test_gradients_are_those_of_finite_differences(stereo):
 @pytest.mark.parametrize("name", PEERS)
 @pytest.mark.parametrize(("views", "size"), [(2, (42, 70)), (3, (56, 28)), (5, (28, 42))])
 def test_batch_mates_change_nothing(name, views, size):
-    """Sides that are no multiples of a cell; a view that shows nobody."""
+    """Includes sides that are not multiples of a cell, and a view without a subject."""
     model, batches = peer(name), [make_batch(1, views, *size), make_batch(1, views, *size, zoom=0.6)]
     masks = batches[0].masks.clone()
     masks[:, 0] = False
@@ -149,7 +150,7 @@ def test_batch_mates_change_nothing(name, views, size):
 
 
 def test_depths_lie_between_the_bounds_of_the_subject(stereo):
-    """Of the nearest and the farthest of its pixels; far off, a gradient leads back."""
+    """Between those of its nearest and farthest pixels; far outside, the gradient points back."""
     batch, model = make_batch(1, 3, 56, 56), peer("gps")
     bounds = SubjectBox()(batch)
     for change in (-1e4, 1e4):
@@ -163,7 +164,7 @@ def test_depths_lie_between_the_bounds_of_the_subject(stereo):
 
 
 def test_a_sweep_and_its_table_compare_it_with_others(tmp_path, monkeypatch, capsys):
-    """Trained, saved, loaded and measured from outside of the package, by the same commands."""
+    """Trained, saved, loaded and evaluated from outside the package, with the same commands."""
     render_boxes(tmp_path / "rendered", tmp_path / "scans", train=1, val=1)
     monkeypatch.chdir(tmp_path)
     common = ["--config-dir", str(FOLDER / "conf"), "views=v3", "evaluation.targets=[midway]"]
