@@ -1,5 +1,4 @@
-"""Dense prediction head (DPT): fuses four layers of tokens from coarse to fine into one
-map per image."""
+"""Dense prediction head (DPT): fuses four layers of tokens from coarse to fine into one map per image."""
 
 import dataclasses
 import functools
@@ -30,14 +29,14 @@ BASE = 100.0
 def _axis_waves(
     channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "c n"]:
-    """Sines, then cosines along one axis times ``SCALE``, in float32.
+    """Sines, then as many cosines, along one axis times :data:`SCALE`, in float32.
 
     Args:
-        channels: a multiple of 4 divided by 2: as many sines as cosines.
+        channels: number of waves, even.
         count: number of cells.
-        half_extent: the cells lie between its negative and itself; samples are their centres.
-        dtype: of the places of the centres.
-        device: of the result.
+        half_extent: the cells cover [-half_extent, half_extent]; samples are their centres.
+        dtype: dtype of the centres' positions.
+        device: device of the result.
     """
     quarter = channels // 2
     exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
@@ -50,20 +49,16 @@ def _axis_waves(
 def add_positions_(
     x: Float[Tensor, "n c h w"], aspect: float, window: Window | None = None
 ) -> Float[Tensor, "n c h w"]:
-    """Add a position embedding in place.
+    """Add a position embedding in place, and return ``x``.
 
-    Waves of the column in the first half of the channels, of the row in the second.
-
-    The unit is half the diagonal of the image; samples are cell centres. The waves of each axis are
-    cached (a few kilobytes); the embedding is never built as a map.
+    The first half of the channels gets waves along the columns, the second half along the rows. The
+    unit is half the diagonal of the image; samples are cell centres. The waves of each axis are
+    cached (a few kilobytes); the embedding is never materialised as a map.
 
     Args:
-        x: maps, whose channels are a multiple of 4; changed.
+        x: maps, whose number of channels is a multiple of 4.
         aspect: width / height of the image.
-        window: the part of whole maps that ``x`` is; None: all.
-
-    Returns:
-        ``x``.
+        window: part of whole maps that ``x`` covers; None: all.
     """
     window = window or Window.whole(tuple(x.shape[2:]))
     half = x.shape[1] // 2
@@ -79,15 +74,14 @@ def add_positions_(
 
 
 LEVELS = 4
-#: Cells per patch along an axis in the three finer levels;
-#: the coarsest has one cell for two patches.
+#: Cells per patch along an axis in the three finer levels; the coarsest has one cell per two patches.
 CELLS = (4, 2, 1)
 NORM_EPS = 1e-5
 #: Channels before the last convolution, as published.
 HIDDEN = 32
 
-#: Without a gradient: values of a map at full resolution in memory at once, on a CPU and on a GPU,
-#: and the smallest number of rows.
+#: Without a gradient: largest number of values of a full-resolution map in memory, on a CPU and on a
+#: GPU, and least number of rows computed at once.
 _LARGEST = 1 << 21
 _GPU_LARGEST = 1 << 28
 _ROWS = 8
@@ -97,13 +91,10 @@ Widths = tuple[int, tuple[int, int, int, int]]
 
 
 def published_widths(dim_latent: int) -> Widths:
-    """Channels of the fused maps, and of the four levels from fine to coarse,
-    in the published proportions.
+    """Channels of the fused maps, and of the four levels from fine to coarse, in published proportions.
 
-    1/8 of the tokens' width (a multiple of 8), and 1/8, 1/4, 1/2, 1/2 (multiples of 4).
-
-    Args:
-        dim_latent: width of the tokens; with 2048, as published, 256, and 256, 512, 1024, 1024.
+    1/8 of the tokens' width (a multiple of 8), and 1/8, 1/4, 1/2, 1/2 (multiples of 4). With 2048, as
+    published: 256, and 256, 512, 1024, 1024.
     """
     levels = tuple(_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2))
     return _multiple(dim_latent / 8, 8), levels
@@ -118,27 +109,26 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 
 
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
-    """A 1x1 convolution as a linear layer on pixels, without a copy,
-    since channels are innermost."""
+    """Apply a 1x1 convolution as a linear layer on pixels; no copy, since channels are innermost."""
     return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
 class _Halving(nn.Conv2d):
-    """The convolution of the coarsest level."""
+    """Strided convolution of the coarsest level."""
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         if x.device.type != "cpu" or x.shape[-1] > 1:
             return super().forward(x)
-        # For maps one cell wide in bfloat16,
-        # PyTorch 2.13 leaves parts of the weight's gradient unset.
+        # For bfloat16 maps one cell wide, PyTorch 2.13 leaves parts of the weight's gradient unset.
         with exact("cpu"):
             return super().forward(at_least_float32(x))
 
 
 class ResidualUnit(nn.Module):
-    """``s + conv2(relu(conv1(relu(x))))`` with ``s = relu(x)``, or ``s = x`` without a rectified
-    skip. Published weights expect a rectified skip. In training it can die: where all channels of a
-    sum of levels are negative, tokens no longer affect the result and get no gradient."""
+    """``s + conv2(relu(conv1(relu(x))))`` with ``s = relu(x)``, or ``s = x`` without a rectified skip.
+
+    Published weights expect a rectified skip. In training it can die: where all channels of a sum of
+    levels are negative, tokens no longer affect the result and get no gradient."""
 
     def __init__(self, features: int, rectified_skip: bool = True):
         super().__init__()
@@ -153,8 +143,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Add a finer level to the coarser result and refine it;
-    the coarsest block only refines its level."""
+    """Adds a finer level to the coarser result and refines the sum; the coarsest block only refines."""
 
     def __init__(self, features: int, joins: bool, rectified_skip: bool):
         super().__init__()
@@ -166,27 +155,27 @@ class Fusion(nn.Module):
     def forward(
         self, x: Float[Tensor, "n c h w"] | None, level: Float[Tensor, "n c h2 w2"], place: "LevelWindows"
     ) -> Float[Tensor, "n c h w"]:
-        """The refined sum of the coarser result and a level in the window ``place.joined``.
+        """Refine the sum of the coarser result and a level in the window ``place.joined``.
 
         Args:
-            x: the coarser result in this window, which may be overwritten;
-                None for the coarsest level.
-            level: in the window ``place.level``.
+            x: the coarser result in this window, which may be overwritten; None for the coarsest
+                level.
+            level: map of the level in the window ``place.level``.
             place: windows of the level.
         """
         if x is not None:
             level = self.resConfUnit1(level)
         level = place.level.cut(level, place.joined)
         x = self.resConfUnit2(level if x is None else x.add_(level))
-        # A 1x1 convolution commutes with interpolation; before it, it has a quarter of the cost.
+        # A 1x1 convolution commutes with interpolation; applied before, it has a quarter of the cost.
         return _pointwise(self.out_conv, x)
 
 
 class Scratch(nn.Module):
-    """Everything after the resize layers, under its published names.
+    """Layers after the resize layers, under their published names.
 
     Args:
-        out_channels: of the levels, from fine to coarse.
+        out_channels: channels of the levels, from fine to coarse.
         features: channels of the fused maps.
         hidden: channels before the last convolution.
         output_dim: channels of the result.
@@ -208,7 +197,7 @@ class Scratch(nn.Module):
 
 @dataclass(frozen=True)
 class LevelWindows:
-    """Windows of a level: of its tokens, its map, and the sum with the coarser result."""
+    """Windows of a level: of its tokens, of its map, and of the sum with the coarser result."""
 
     tokens: Window
     level: Window
@@ -217,9 +206,10 @@ class LevelWindows:
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows that a head computes for the window ``result`` of its result. Zero padding corrupts
-    the border of a window, so each is larger than needed by the reach of its layers, as far as
-    the map goes."""
+    """Windows of intermediate maps that a head computes for the window ``result`` of its output.
+
+    Zero padding corrupts the border of a window, so each is enlarged by the receptive field of its
+    layers, clipped to the map."""
 
     result: Window
     full: Window
@@ -234,9 +224,9 @@ class DPTHead(nn.Module):
         dim_latent: width of a token of ``Tokens.latent``.
         output_dim: channels of the result.
         rectified_skip: as in :class:`ResidualUnit`.
-        guide_channels: channels of a guide at full resolution (:mod:`ghgs_lit.method.heads.guide`), which
-            keeps a small head sharp; 0: none, as published.
-        widths: channels inside; None: :func:`published_widths`.
+        guide_channels: channels of a full-resolution guide (:mod:`ghgs_lit.method.heads.guide`), which
+            keeps a small head sharp; 0: no guide, as published.
+        widths: internal channels; None: :func:`published_widths`.
     """
 
     def __init__(
@@ -262,23 +252,22 @@ class DPTHead(nn.Module):
     def forward(
         self, tokens: Tokens, guide: Guide | None = None, window: Window | None = None
     ) -> Float[Tensor, "bv o h w"]:
-        """Raw maps of all images, float32 or wider; float16 autocast is turned off.
+        """Raw maps of all images, in float32 or wider; float16 autocast is disabled.
 
         Args:
-            tokens: of four layers.
+            tokens: tokens of four layers.
             guide: maps of whole images, if ``guide_channels`` is not 0.
-            window: the part of the maps to compute, in pixels; None: all.
+            window: part of the maps to compute, in pixels; None: all.
 
         Raises:
-            InputError: there are not four layers of tokens.
+            InputError: tokens do not have four layers.
         """
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
         with without_float16(tokens.semantic.device.type):
             return self._maps(tokens, guide, window)
 
     def _maps(self, tokens: Tokens, guide: Guide | None, window: Window | None) -> Tensor:
-        """:meth:`forward` in the current precision;
-        levels are computed from coarse to fine."""
+        """:meth:`forward` in the current precision."""
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
         windows = self.windows(window or Window.whole(size), (rows, columns))
@@ -290,7 +279,7 @@ class DPTHead(nn.Module):
             full, half, quarter = self.guide(guide, targets)
 
         x = None
-        # One level at a time: coarse levels have large weights, fine ones large maps.
+        # Coarse to fine, one level at a time: coarse levels have large weights, fine ones large maps.
         for i in reversed(range(LEVELS)):
             place = windows.levels[i]
             level = self._level(i, tokens, place)
@@ -313,30 +302,21 @@ class DPTHead(nn.Module):
         aspect: float,
         result: Window,
     ) -> Float[Tensor, "n o h3 w3"]:
-        """The window ``result`` of the result, from the map before the last interpolation.
-
-        Args:
-            x: half of the fused channels, in ``windows.fused``.
-            guide: maps of the guide at full resolution, in ``windows.full``; None: no guide.
-            windows: of the head.
-            aspect: width / height of the image.
-            result: a part of ``windows.result``.
-        """
+        """Compute the window ``result`` of the output from the map ``x`` in ``windows.fused``, before the
+        last interpolation; ``guide`` covers ``windows.full``."""
         layers = self.scratch.output_conv2
         seen = result.grown(reach(layers))
         x = add_positions_(windows.fused.resize(x, seen), aspect, seen)
         if guide is not None:
             x = x + windows.full.cut(guide, seen)
         x = layers[:-1](x)
-        # In float32 also under autocast: depths and offsets of millimetres depend on
-        # this projection.
+        # In float32 even under autocast: depths and offsets must be accurate to millimetres.
         last = layers[-1]
         with exact(x.device.type):
             return seen.cut(_pointwise(last, x.to(last.weight.dtype)), result)
 
     def _parts(self, x: Float[Tensor, "n c h w"], window: Window) -> list[Window]:
-        """Parts of a window along its rows; without a gradient these largest maps are
-        computed in turn."""
+        """Split a window along its rows; without a gradient, these largest maps are computed in turn."""
         if torch.is_grad_enabled():
             return [window]
         rows, columns = window
@@ -346,10 +326,10 @@ class DPTHead(nn.Module):
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
-        """Windows of each level, from fine to coarse, that a window of the result depends on.
+        """Windows of each level, from fine to coarse, that a window of the output depends on.
 
         Args:
-            result: in pixels.
+            result: window of the output, in pixels.
             grid: rows and columns of patches.
         """
         s = self.scratch
@@ -373,9 +353,9 @@ class DPTHead(nn.Module):
         return Windows(result, full, fused, tuple(levels))
 
     def _level(self, i: int, tokens: Tokens, place: LevelWindows) -> Float[Tensor, "bv c h w"]:
-        """Level ``i``, 0 is the finest, with the channels of the fused maps in ``place.level``."""
+        """Map of level ``i`` (0: finest) in ``place.level``, with the channels of the fused maps."""
         aspect = tokens.grid[3] / tokens.grid[2]
-        if tokens.is_dense:  # tokens outside the window are left out without a copy
+        if tokens.is_dense:  # slicing drops tokens outside the window without a copy
             b, v, *grid = tokens.grid
             inside = tokens.latent[i].unflatten(0, (b * v, *grid))[:, *place.tokens.slices]
             maps = self._project(i, inside).permute(0, 3, 1, 2)
@@ -386,8 +366,7 @@ class DPTHead(nn.Module):
         return getattr(self.scratch, f"layer{i + 1}_rn")(level)
 
     def _project(self, i: int, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n o"]:
-        """Normalised and projected tokens; the published 1x1 convolution is a linear
-        layer on tokens."""
+        """Normalise and project tokens; the published 1x1 convolution is a linear layer on tokens."""
         project = self.projects[i]
         if not torch.is_autocast_enabled(x.device.type):
             x = x.to(project.weight.dtype)  # tokens of an encoder under float16 autocast

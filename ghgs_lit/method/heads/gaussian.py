@@ -48,15 +48,8 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
 
 
 def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
-    """``mlp(x)`` with its last projection in float32 under autocast:
-    offsets of millimetres depend on it.
-
-    Under float16 autocast all of it is in float32.
-
-    Args:
-        mlp: layers, the last one linear.
-        x: rows.
-    """
+    """``mlp(x)`` with the last, linear layer in float32 under autocast, so that offsets are accurate to
+    millimetres; under float16 autocast all layers are in float32."""
     with without_float16(x.device.type):
         hidden = mlp[:-1](x)
         last = mlp[-1]
@@ -65,41 +58,39 @@ def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
 
 
 class GaussianHeadOptions(Options):
-    """Recalibrated tokens to one Gaussian for each pixel of the subject."""
+    """Gaussian head: recalibrated tokens to one Gaussian per pixel of the subject."""
 
     group = "gaussian_head"
     rectified_skip: bool = True
-    """Residual units add what they rectified, as published weights expect;
-    in training it can die."""
+    """Residual units add the rectified input, as published weights expect; in training, units can die."""
     guide: bool = False
-    """Adds images, masks and depths at full resolution to the input of the dense head;
-    the paper: false."""
+    """Add images, masks and depths at full resolution to the input of the dense head (paper: false)."""
     photo_consistency: bool = False
-    """Adds photo-consistency at the predicted depth to the guide: a splat off the surface can become
-    transparent; the paper: false."""
+    """Add photo-consistency at the predicted depth to the guide, so that a splat off the surface can
+    become transparent (paper: false)."""
     color_limit: Share = 0.0
-    """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of
-    splats and for dark rims; 0: none (the paper)."""
+    """Largest change of a colour from its pixel's, per channel, to compensate the blur of splats and dark
+    rims; 0: no change (paper)."""
     offset_limit: Positive | None = OFFSET_UNIT
-    """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: none,
-    as published. With parameterization=footprint; release has none."""
+    """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: no limit, as
+    published. Only with parameterization=footprint."""
     low_pass: Amount = 0.3
-    """Low-pass filter of the renderer that splats are predicted for, in px^2; 0.3: gsplat's default."""
+    """Low-pass filter, in px^2, of the renderer that splats are predicted for; 0.3: gsplat's default."""
     antialiased: bool = False
     """Predict splats for a renderer that compensates the opacity added by the low-pass filter
     (Mip-Splatting)."""
     channels: Width = 32
     """Width of the descriptor of a pixel (32 as published)."""
     hidden: tuple[Width, Width] = (128, 32)
-    """Widths inside the networks of the attributes (as published)."""
+    """Hidden widths of the attribute networks (as published)."""
     parameterization: Literal["footprint", "release"] = "footprint"
-    """footprint: attributes in units of a pixel's footprint, raw values start at 0; release:
-    offsets and scales in metres, without bound, PyTorch's initialisation."""
+    """footprint: attributes in units of a pixel's footprint, raw values initially 0; release: offsets and
+    scales in metres, unbounded, PyTorch's initialisation."""
     axes: Literal["world", "surface"] = "world"
-    """Axes of offsets, scales and rotations: the world's, or normal and tangents of the predicted
-    depth, which look alike from every camera (not the paper's)."""
+    """Axes of offsets, scales and rotations: world | surface: normal and tangents of the predicted depth,
+    which look alike from every camera (not in the paper)."""
     attributes: FootprintAttributes = FootprintAttributes()
-    """With parameterization=footprint."""
+    """Options of parameterization=footprint."""
 
     @model_validator(mode="after")
     def _check(self) -> "GaussianHeadOptions":
@@ -108,13 +99,14 @@ class GaussianHeadOptions(Options):
         return self
 
     def build(self, dim_latent: int) -> "GaussianHead":
-        """The stage for tokens of width ``dim_latent``."""
+        """Build the stage for tokens of width ``dim_latent``."""
         return GaussianHead(self, dim_latent)
 
 
 class GaussianHead(nn.Module):
-    """A dense head over the recalibrated tokens, then small networks for each pixel of the subject.
-    Colours are those of the input pixels, unless ``color_limit`` lets them change. The names of the
+    """Dense head over the recalibrated tokens, then small networks on each pixel of the subject.
+
+    Colours are those of the input pixels, up to changes within ``color_limit``. The names of the
     networks and their linear layers 0, 2 and 4 are the published ones."""
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):
@@ -145,7 +137,7 @@ class GaussianHead(nn.Module):
 
     @property
     def has_offset_limit(self) -> bool:
-        """Whether offsets are limited; those of the authors' release never are."""
+        """Whether offsets are limited; never with the release's attributes."""
         return self.attributes is not release_attributes and self.options.offset_limit is not None
 
     def forward(
@@ -156,15 +148,16 @@ class GaussianHead(nn.Module):
         depth_maps: DepthMaps,
         plan: Plan,
     ) -> RawGaussians:
-        """Raw attributes of the subject's pixels with a valid point, by element, view, row, column.
+        """Predict raw attributes of the subject's pixels with a valid point, ordered by element, view, row,
+        column.
 
         Args:
-            tokens: recalibrated ones.
+            tokens: recalibrated tokens.
             batch: images, masks and cameras are read.
-            points: which pixels have a valid point.
-            depth_maps: in metres, read by a guide.
-            plan: its ``windows`` and the subject's pixels are computed; with ``pixels="all"`` every
-                pixel, to select afterwards: the result is the same.
+            points: define the pixels with a valid point.
+            depth_maps: in metres, used by a guide.
+            plan: selects windows and pixels to compute; with ``pixels="all"`` every pixel is computed
+                first, with the same result.
         """
         views, height, width = points.valid.shape[1:]
         rows = plan.subject.only(points.valid)
@@ -179,13 +172,13 @@ class GaussianHead(nn.Module):
         return RawGaussians(*values[:5], color, image, pixel, rows.splits(views), rows.real)
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """Gaussians from raw attributes, at the points of their pixels.
+        """Convert raw attributes to Gaussians at the points of their pixels.
 
         Args:
-            raw: of :meth:`forward`; rounds change them.
+            raw: from :meth:`forward`, possibly changed by rounds.
             batch: images, mattes and cameras are read.
-            points: of pixels in the world, in metres.
-            depth_maps: in metres, of these points.
+            points: points of pixels in the world, in metres.
+            depth_maps: depths of these points, in metres.
         """
         numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
         photo = batch.once(surface_colors)
@@ -204,7 +197,7 @@ class GaussianHead(nn.Module):
         return Gaussians(*fields, raw.splits, raw.image, raw.pixel, **constants)
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
-        """The guide, with relative depths and perhaps photo-consistency; None without one."""
+        """Guide with relative depths and, optionally, photo-consistency; None for a head without one."""
         if self.decoder.guide is None:
             return None
         maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]
@@ -220,10 +213,10 @@ class GaussianHead(nn.Module):
 
         Args:
             part: decoded maps of consecutive images.
-            image: numbers of the images (``b * V + v``) of all pixels of the subject.
-            pixel: their row-major indices.
+            image: index ``b * V + v`` of the image of each of the subject's pixels.
+            pixel: row-major indices of these pixels.
             rows: the same pixels by image.
-            everywhere: compute values of every pixel first, one image at a time, to save memory: hidden
+            everywhere: compute values of every pixel first, one image at a time to save memory: hidden
                 layers are wider than the maps.
         """
         within = rows.within(part.images)

@@ -1,6 +1,8 @@
-"""Sequences of different lengths packed into one tensor: views keep different numbers of patches.
-Only the attention of a block mixes tokens, so views need no padding. Where shapes must repeat, on a
-GPU, each view's rows are padded to a shape bucket, and nothing attends to the padding."""
+"""Kept patches: sequences of different lengths packed into one tensor.
+
+Views keep different numbers of patches. Only attention mixes tokens, so views need no padding on a
+CPU. On a GPU, where shapes must repeat, each view's rows are padded to a shape bucket, and the padding
+is masked in attention."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -15,18 +17,18 @@ from ghgs_lit.method.plan.rows import Rows
 
 
 class KeptPatches:
-    """The kept patches of a batch, and their places among packed tokens. Packed tokens [T, C] are
-    the sequences of all images, one after another: the special tokens of an image (class, camera or
-    registers), then its kept patches, row by row.
+    """The kept patches of a batch, and their positions among packed tokens.
+
+    Packed tokens [T, C] are the concatenated sequences of all images: the special tokens of an image
+    (class, camera or registers), then its kept patches, row by row. Positions are computed on first
+    use.
 
     Args:
-        kept: on any device.
-        device: that of the tokens.
-        known: the extent of the kept patches of each image; None: computed from ``kept``.
-        size: number of rows of each image, at least that of its kept patches: others repeat its
-            last one (the first of all patches where none is kept); None: those that are kept.
-
-    Places are computed on first use."""
+        kept: mask of kept patches, on any device.
+        device: device of the tokens.
+        known: extent of the kept patches of each image; None: computed from ``kept``.
+        size: number of rows per image, at least that of its kept patches: the rest repeats the last one
+            (the first patch if none is kept); None: no padding."""
 
     def __init__(
         self,
@@ -49,29 +51,24 @@ class KeptPatches:
 
     @classmethod
     def whole(cls, grid: Sequence[int], device: torch.device) -> "KeptPatches":
-        """All patches of a grid.
-
-        Args:
-            grid: [b, v, h, w]: elements, views, rows and columns of patches.
-            device: that of the tokens.
-        """
+        """All patches of a grid [b, v, h, w] of elements, views, rows and columns."""
         images, (height, width) = grid[0] * grid[1], grid[2:]
         kept = torch.ones(*grid, dtype=torch.bool, device=device)
         return cls(kept, device, [Extent(height * width, 0, height, 0, width)] * images)
 
     @cached_property
     def _rows(self) -> Rows:
-        """Rows of one number for each image."""
+        """Rows padded to the same number for each image."""
         return Rows.filled(self.mask.flatten(0, 1).flatten(1), self.size, 1)
 
     @property
     def real(self) -> Bool[Tensor, " N"] | None:
-        """Which rows are kept patches; None: all."""
+        """Rows that are kept patches rather than padding; None: all."""
         return None if self.size is None else self._rows.real
 
     @cached_property
     def index(self) -> Int[Tensor, " N"]:
-        """Place of each row among all patches."""
+        """Index of each row's patch among all patches."""
         if self.is_whole:
             return torch.arange(self._kept.numel(), device=self.device)
         if self.size is None:
@@ -85,35 +82,35 @@ class KeptPatches:
 
     @cached_property
     def row(self) -> Int[Tensor, " N"]:
-        """Row of each one's patch."""
+        """Grid row of each row's patch."""
         return self.index // self.grid[3] % self.grid[2]
 
     @cached_property
     def column(self) -> Int[Tensor, " N"]:
-        """Column of each one's patch."""
+        """Grid column of each row's patch."""
         return self.index % self.grid[3]
 
     @cached_property
     def number(self) -> Int[Tensor, " p"]:
-        """The number of each kept one of all patches; 0 or more for others, without a meaning."""
+        """For each of all patches, its row if it is kept; otherwise a meaningless valid index."""
         if self.size is not None:
             return self._rows.places(self.mask.numel())[1]
         return self.index if self.is_whole else (self.mask.flatten().cumsum(0) - 1).clamp(min=0)
 
     @cached_property
     def mask(self) -> Bool[Tensor, "b v h w"]:
-        """The kept patches, on the tokens' device."""
+        """Mask of the kept patches, on the tokens' device."""
         if self.is_whole:
             return torch.ones(self.grid, dtype=torch.bool, device=self.device)
         return self._kept.to(self.device)
 
     @property
     def is_even(self) -> bool:
-        """Whether all images have the same number of rows, which is known without reading masks."""
+        """Whether all images are known to have the same number of rows, without reading masks."""
         return self.is_whole or self.size is not None
 
     def real_tokens(self, special: int) -> Bool[Tensor, " t"] | None:
-        """Which packed tokens are special ones or kept patches; None: all.
+        """Packed tokens that are special tokens or kept patches rather than padding; None: all.
 
         Args:
             special: number of special tokens in each image.
@@ -123,19 +120,18 @@ class KeptPatches:
         return F.pad(self.real.unflatten(0, (-1, self.size)), (special, 0), value=True).flatten()
 
     def lengths(self, special: int) -> list[int]:
-        """Number of tokens of each image, with ``special`` special ones."""
+        """Number of tokens of each image, including ``special`` special ones."""
         return [extent.count + special for extent in self._extents]
 
     def element_lengths(self, special: int) -> list[int]:
-        """Number of tokens of each batch element, with ``special`` special ones in each view."""
+        """Number of tokens of each batch element, including ``special`` special ones in each view."""
         return [sum(element) + len(element) * special for element in self._counts]
 
     def box(self, margin: int) -> tuple[slice, slice]:
-        """Rows and columns of the patches that are kept in any image, with a margin;
-        at least one patch.
+        """Rows and columns of the bounding box of patches kept in any image, at least one patch.
 
         Args:
-            margin: patches on each side, as far as the grid goes.
+            margin: number of patches added on each side, clipped to the grid.
         """
         filled = [extent for extent in self._extents if extent.count] or [Extent(1, 0, 1, 0, 1)]
         rows = min(e.top for e in filled), max(e.bottom for e in filled)
@@ -144,16 +140,16 @@ class KeptPatches:
         return tuple(slice(max(a - margin, 0), min(b + margin, side)) for (a, b), side in sides)
 
     def select(self, patches: Float[Tensor, "n p c"]) -> Float[Tensor, "N c"]:
-        """The kept ones of the tokens of all patches."""
+        """Select the kept patches from the tokens of all patches."""
         flat = patches.flatten(0, 1)
         return flat if self.is_whole else flat[self.index]
 
     def join(self, special: Tensor, patches: Tensor) -> Tensor:
-        """Special tokens and patch tokens packed together.
+        """Pack special tokens and patch tokens.
 
         Args:
-            special: [B * V, s, C], of each image.
-            patches: [N, C], of the kept patches.
+            special: special tokens of each image [B * V, s, C].
+            patches: tokens of the kept patches [N, C].
 
         Returns:
             Packed tokens [B * V * s + N, C] in the wider dtype.
@@ -171,20 +167,15 @@ class KeptPatches:
         return packed.index_copy_(0, self._places(count), patches.to(dtype))
 
     def take(self, packed: Float[Tensor, "t c"], special: int) -> Float[Tensor, "N c"]:
-        """The patch tokens of packed tokens.
-
-        Args:
-            packed: tokens of all images.
-            special: number of special ones in each image.
-        """
+        """Extract the patch tokens of packed tokens with ``special`` special ones per image."""
         if self.is_even:
             images = self.grid[0] * self.grid[1]
             return packed.unflatten(0, (images, -1))[:, special:].flatten(0, 1)
         return packed[self._places(special)]
 
     def positions(self, special: int) -> Int[Tensor, "t 2"]:
-        """``(row, column)`` of packed tokens in the image: (0, 0) for special ones,
-        from (1, 1) for patches.
+        """``(row, column)`` of packed tokens in the image: (0, 0) for special ones, patches start at
+        (1, 1).
 
         Args:
             special: number of special tokens in each image.
@@ -194,8 +185,7 @@ class KeptPatches:
         return self.join(at_patches.new_zeros(b * v, special, 2), at_patches)
 
     def _places(self, special: int) -> Int[Tensor, " N"]:
-        """Places of the patch tokens among packed ones,
-        found once for each number of special tokens."""
+        """Cached indices of the patch tokens among packed tokens."""
         if special not in self._packed:
             numbers = torch.arange(len(self.index), device=self.index.device)
             self._packed[special] = numbers + (self.image + 1) * special

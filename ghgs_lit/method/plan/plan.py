@@ -1,5 +1,4 @@
-"""The plan of a batch, and the one place where a prediction copies mask statistics from a GPU
-to the host."""
+"""The plan of a batch, and the only place where a prediction copies mask statistics to the host."""
 
 import dataclasses
 import functools
@@ -20,20 +19,20 @@ from ghgs_lit.method.plan.rows import Rows, rounds_up
 from ghgs_lit.method.plan.window import Span, Window, subject_windows
 from ghgs_lit.types import DecodedPixels, Prediction
 
-#: Factor by which sizes exceed the need after earlier ones were too small.
+#: Safety factor of sizes after earlier ones were too small.
 _SPARE = 1.15
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """A shape bucket: sizes that all its scenes share.
+    """A shape bucket: sizes shared by all its scenes.
 
     Attributes:
-        pixels: rows of the subject's pixels, of each element.
-        peers: rows of the tokens that are recalibrated, of each element.
-        kept: rows of the kept patches, of each image; 0: all patches.
-        shown: rows of the foreground patches, of each image.
-        window: patches in which every subject lies.
+        pixels: rows of the subject's pixels per element.
+        peers: rows of recalibrated tokens per element.
+        kept: rows of kept patches per image; 0: all patches.
+        shown: rows of foreground patches per image.
+        window: window of patches that contains every subject.
     """
 
     pixels: int
@@ -49,16 +48,15 @@ class Plan:
 
     Attributes:
         masks: the subject's pixels.
-        shown: patches with a pixel of the subject.
+        shown: foreground patches, those with a pixel of the subject.
         kept: patches that become tokens.
-        extents: of the subject in each image ``b * V + v``.
-        shown_extents: of the patches ``shown``, in patches.
-        patch_size: in pixels.
+        extents: extent of the subject in each image ``b * V + v``.
+        shown_extents: extent of the patches ``shown`` in each image, in patches.
+        patch_size: side of a patch in pixels.
         pixels: pixels that dense heads decode; ``all``: whole views.
-        tokens: tokens that are recalibrated;
-            ``all``: including the background's, which need depths, too.
+        tokens: tokens that are recalibrated; ``all``: including the background's, which need depths, too.
         flags: values of further tensors that were read with the masks.
-        sizes: numbers of rows, and windows (:mod:`ghgs_lit.method.plan.rows`); None: those of the scene."""
+        sizes: the shape bucket; None: exact sizes of the scene."""
 
     masks: Bool[Tensor, "B V H W"]
     shown: Bool[Tensor, "B V h w"]
@@ -73,7 +71,7 @@ class Plan:
 
     @cached_property
     def shown_patches(self) -> KeptPatches:
-        """The patches ``shown``, each of which has a token."""
+        """The patches ``shown``, all of which have tokens."""
         size = None if self.sizes is None else self.sizes.shown
         return KeptPatches(self.shown, self.kept.device, self.shown_extents, size)
 
@@ -86,7 +84,7 @@ class Plan:
 
     @cached_property
     def peers(self) -> Rows:
-        """Tokens that are recalibrated, among the packed ones, by element."""
+        """Recalibrated tokens among the packed ones, by element."""
         kept = self.kept
         everyone = self.tokens == "all"
         if self.sizes is not None:
@@ -110,14 +108,9 @@ class Plan:
         return _of_elements(self.extents, self.views)
 
     def trimmed(self, prediction: Prediction) -> Prediction:
-        """The prediction with Gaussians for the subject's pixels alone.
+        """Remove Gaussians (also of the rounds' drafts) that pad a shape bucket.
 
-        Args:
-            prediction: Gaussians, and drafts of the rounds, may fill a shape bucket.
-
-        Returns:
-            On a GPU those of pixels whose depth is not finite stay, with opacity 0.
-        """
+        On a GPU, Gaussians of pixels with a depth that is not finite remain, with opacity 0."""
         counts = self.counts
         if self.sizes is None or prediction.gaussians.splits != (self.sizes.pixels,) * len(counts):
             return prediction
@@ -128,17 +121,12 @@ class Plan:
 
     @property
     def is_bucket(self) -> bool:
-        """Whether sizes are those of a shape bucket, and every image can have a row of it."""
+        """Whether the plan has a shape bucket with at least one row for every image."""
         return self.sizes is not None and min(self.sizes.pixels, self.sizes.peers) >= self.views
 
     def bucket_extents(self) -> tuple[tuple[Extent, ...], tuple[Extent, ...]]:
-        """Extents that are the same for every scene of the shape bucket.
-
-        Each image has a share of its element's rows, in the window of all.
-
-        Returns:
-            Extents of the subject in pixels, and of the patches that show it, of each image.
-        """
+        """Extents in each image of the subject, in pixels, and of the foreground patches, equal for every
+        scene of the shape bucket: each image gets a share of its element's rows, in the common window."""
         grid = Window.whole(tuple(self.shown.shape[2:]))
         parts = ((self.sizes.pixels, self.windows_of(self.patch_size)[0]), (self.sizes.peers, grid))
         shared = []
@@ -150,23 +138,23 @@ class Plan:
 
     @property
     def together(self) -> int:
-        """Number of consecutive images whose maps are decoded in one part."""
+        """Number of consecutive images whose maps are decoded together."""
         return 1 if self.sizes is None else self.views
 
     @property
     def depth_windows(self) -> list[Window | None] | None:
-        """Windows in which depths are needed, of whole patches; None: everywhere."""
-        # Whole patches: the token points of the release depend on pixels beside the mask.
+        """Windows of whole patches in which depths are needed; None: everywhere."""
+        # Whole patches: the release's token points depend on pixels outside the mask.
         return None if "all" in (self.pixels, self.tokens) else self.windows_of(self.patch_size)
 
     @property
     def windows(self) -> list[Window | None] | None:
-        """Windows with the subject's pixels of each image; None: whole images are decoded."""
+        """Window of the subject's pixels in each image; None: whole images are decoded."""
         return None if self.pixels == "all" else self.windows_of(1)
 
     def windows_of(self, cell: int) -> list[Window | None]:
-        """Windows of whole cells around the subject of each image, None without one; of a shape bucket
-        all patches of its window."""
+        """Windows of whole cells around the subject of each image, None if it has none; with a shape
+        bucket, its window."""
         size = tuple(self.masks.shape[2:])
         if self.sizes is not None:
             return [self.sizes.window.finer(self.patch_size, size)] * len(self.extents)
@@ -187,11 +175,11 @@ class MaskStatistics:
     """Statistics of masks from which a plan is made, as tensors on their device.
 
     Attributes:
-        shown: patches with a pixel of the subject.
+        shown: foreground patches, those with a pixel of the subject.
         kept: patches that become tokens.
-        numbers: of the patches ``shown``, then :func:`ghgs_lit.extents.extent_numbers` of the masks
-            and of ``kept``.
-        flags: further values that are copied to the host with them.
+        numbers: counts of ``shown``, then :func:`ghgs_lit.extents.extent_numbers` of the masks and of
+            ``kept``.
+        flags: further values to copy to the host together with them.
     """
 
     shown: Bool[Tensor, "B V h w"]
@@ -207,13 +195,13 @@ class MaskStatistics:
         kept: Bool[Tensor, "B V h w"],
         flags: Sequence[Bool[Tensor, ""]] = (),
     ) -> "MaskStatistics":
-        """Statistics of masks.
+        """Compute the statistics of masks.
 
         Args:
             masks: the subject's pixels; sides are divisible by the patch size.
             patch_size: in pixels.
             kept: patches that become tokens.
-            flags: further values that are copied to the host with them.
+            flags: further values to copy to the host together with them.
         """
         shown = patches_around_subject(masks, patch_size, 0)
         extents = (extent_numbers(masks.flatten(0, 1)), extent_numbers(kept.flatten(0, 1)))
@@ -230,17 +218,17 @@ def make_plan(
     in_buckets: bool | None = None,
     least: Sizes | None = None,
 ) -> Plan:
-    """The plan of a batch; the only device-to-host synchronisation.
+    """Make the plan of a batch, with the only device-to-host synchronisation.
 
     Args:
         masks: the subject's pixels; sides are divisible by the patch size.
         patch_size: in pixels.
-        kept: patches that become tokens; or all statistics of them and the masks.
-        pixels: of the preset.
-        tokens: which ones the recalibration works on.
-        flags: tensors whose values are to be read with the statistics, and after them.
-        in_buckets: whether sizes are rounded up to shape buckets; None: on a GPU only.
-        least: sizes of a shape bucket, reused while they suffice; None: sizes of the scene.
+        kept: patches that become tokens, or the complete statistics.
+        pixels: pixels that dense heads decode.
+        tokens: tokens that are recalibrated.
+        flags: further tensors to read, after those of the statistics.
+        in_buckets: round sizes up to shape buckets; None: on a GPU only.
+        least: sizes of a shape bucket, reused if they suffice; None: sizes of the scene.
     """
     of_masks = kept if isinstance(kept, MaskStatistics) else MaskStatistics.of(masks, patch_size, kept)
     flags = (*of_masks.flags, *flags)
@@ -275,17 +263,8 @@ def _bucket(
     tokens: DecodedPixels,
     least: Sizes | None,
 ) -> Sizes:
-    """The shape bucket of a scene; arguments as of :func:`make_plan`.
-
-    Args:
-        shape: of the masks [B, V, H, W].
-        patch_size: in pixels.
-        extents: of the masks.
-        shown: of the foreground patches.
-        kept: numbers of the patches that become tokens, of each image; empty: all do.
-        tokens: which ones the recalibration works on.
-        least: sizes that are reused while they suffice.
-    """
+    """Compute the shape bucket of a scene from the extents of masks and of foreground patches (``shown``),
+    and the counts of kept patches (empty: all)."""
 
     def rows(name: str, counts: Sequence[int], most: int) -> int:
         needed = max(1, *counts)
@@ -314,7 +293,7 @@ def _bucket(
 
 
 def _read(tensors: Sequence[Tensor]) -> list[list[int]]:
-    """The values of integer tensors; of all that are not on the CPU at once."""
+    """Read the values of integer tensors, those on a GPU with one copy."""
     there = [tensor.flatten() for tensor in tensors if tensor.device.type != "cpu"]
     values = iter(torch.cat(there).tolist() if there else ())
     read = []

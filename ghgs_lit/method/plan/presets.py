@@ -1,4 +1,4 @@
-"""Presets that leave out patches and pixels."""
+"""Presets for skipping patches and pixels."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,18 +16,17 @@ class KeptTokens(NamedTuple):
 
     @classmethod
     def of_budget(cls, budget: str | int) -> "KeptTokens":
-        """The view for one choice of ``token_budgets``.
+        """The setting for one value of ``token_budgets``.
 
         Args:
-            budget: number of patches around the subject that stay;
-                or a value of ``tokens``, such as ``all``.
+            budget: margin of patches around the subject, or a value of ``tokens``, such as ``all``.
         """
         return cls("subject", budget) if isinstance(budget, int) else cls(budget)
 
 
 @contextmanager
 def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
-    """Changes the patches that an encoder keeps within the context.
+    """Context in which an encoder keeps other patches.
 
     Args:
         encoder: a :class:`ghgs_lit.method.encoder.VGGTEncoder`.
@@ -42,23 +41,23 @@ def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
 
 
 class SkipOptions(Options):
-    """Patches and pixels that are not computed, and the accuracy that this may cost."""
+    """Patches and pixels to skip, and the accuracy that this may cost."""
 
     group = "skip"
     name: Text = "exact"
     """Name of the preset, for reports."""
     tokens: Literal["all", "window", "subject"] = "all"
-    """Patches that the encoder works on: all, those of the smallest rectangle around the subject
-    (window), or the subject's."""
+    """Patches that the encoder processes: all | window: those of the subject's bounding box | subject:
+    those with a pixel of the subject."""
     margin: Patches = 1
-    """Patches around the window or the subject that stay."""
+    """Number of patches around the window or the subject that are kept, too."""
     pixels: DecodedPixels = "subject"
-    """Pixels that the dense heads decode: whole views, or windows around the subject. The depth
-    head decodes all where recalibration.tokens=all: all tokens need a depth."""
+    """Pixels that the dense heads decode: all: whole views | subject: windows around it. The depth head
+    decodes all with recalibration.tokens=all, since all tokens need a depth."""
     budget_db: float | None = 0.001
-    """Largest allowed loss of PSNR compared with skip=none, in dB (`ghgs benchmark` checks it);
-    null: no promise."""
+    """Largest allowed loss of PSNR compared with skip=none, in dB, checked by `ghgs benchmark`; null: not
+    checked."""
     max_rel_diff: Amount | None = 1e-5
-    """Largest difference of 99 of 100 values of an attribute or a render from skip=none, as a share
-    of the largest value, times the factor by which the model amplifies one rounding of the images;
-    `ghgs benchmark` checks it. null: nothing is promised."""
+    """Largest allowed difference from skip=none of 99 of 100 values of an attribute or a render, as a
+    fraction of the largest value, per unit of the model's amplification of one rounding of the images;
+    checked by `ghgs benchmark`; null: not checked."""

@@ -1,5 +1,4 @@
-"""Windows of maps, and the windows that the layers of a dense head need for a window of
-its result."""
+"""Windows of maps, and the windows that layers of a dense head need for a window of its output."""
 
 import itertools
 from collections.abc import Sequence
@@ -23,42 +22,42 @@ class Span(NamedTuple):
     full: int
 
     def grown(self, cells: int) -> "Span":
-        """These and ``cells`` more on each side, as far as the map goes."""
+        """The span enlarged by ``cells`` on each side, clipped to the map."""
         return Span(max(self.start - cells, 0), min(self.stop + cells, self.full), self.full)
 
     def sources(self, full: int) -> "Span":
-        """The cells of a map of ``full`` cells from which these are interpolated."""
+        """Cells of a map of ``full`` cells from which this span is interpolated."""
         first, last = (cell * (full - 1) // max(self.full - 1, 1) for cell in (self.start, self.stop - 1))
         return Span(first, min(last + 2, full), full)
 
     def coarser(self, factor: int) -> "Span":
-        """The blocks of ``factor`` cells that contain these."""
+        """Blocks of ``factor`` cells that contain this span."""
         return Span(self.start // factor, -(-self.stop // factor), -(-self.full // factor))
 
     def finer(self, factor: int, full: int) -> "Span":
-        """The cells of these blocks of ``factor`` cells; the last block may be smaller."""
+        """Cells of these blocks of ``factor`` cells; the last block may be smaller."""
         return Span(self.start * factor, min(self.stop * factor, full), full)
 
     def widened(self) -> "Span":
-        """These and more cells, so that their number is a shape bucket."""
+        """The span enlarged to a length of :func:`ghgs_lit.extents.bucket_size`, within the map."""
         length = min(bucket_size(self.stop - self.start), self.full)
         start = min(self.start, self.full - length)
         return Span(start, start + length, self.full)
 
     def hull(self, other: "Span") -> "Span":
-        """The smallest span of the same map that contains both."""
+        """Smallest span of the same map that contains both."""
         return Span(min(self.start, other.start), max(self.stop, other.stop), self.full)
 
 
 class Window(NamedTuple):
-    """A rectangle of a map: the same part of every image."""
+    """A rectangle of maps, the same in every image."""
 
     rows: Span
     columns: Span
 
     @classmethod
     def whole(cls, size: tuple[int, int]) -> "Window":
-        """All of a map of ``size`` (height, width)."""
+        """The whole map of ``size`` (height, width)."""
         return cls(*(Span(0, full, full) for full in size))
 
     @property
@@ -68,16 +67,16 @@ class Window(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether this is all of the map."""
+        """Whether the window is the whole map."""
         return self == Window.whole(self.full)
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Rows and columns, to index maps."""
+        """Rows and columns as slices, to index maps."""
         return slice(*self.rows[:2]), slice(*self.columns[:2])
 
     def grown(self, cells: int) -> "Window":
-        """Along both axes as of :class:`Span`; so are the next four."""
+        """Apply :meth:`Span.grown` along both axes; the next four methods do likewise."""
         return Window(*(span.grown(cells) for span in self))
 
     def sources(self, full: tuple[int, int]) -> "Window":
@@ -93,12 +92,7 @@ class Window(NamedTuple):
         return Window(*(mine.hull(its) for mine, its in zip(self, other, strict=True)))
 
     def cut(self, maps: Float[Tensor, "n c h w"], inner: "Window") -> Float[Tensor, "n c h2 w2"]:
-        """Maps of this window, cropped.
-
-        Args:
-            maps: of this window.
-            inner: a window within this one, of the same map.
-        """
+        """Crop maps of this window to a window ``inner`` within it."""
         if inner == self:
             return maps
         rows, columns = (
@@ -108,55 +102,38 @@ class Window(NamedTuple):
         return maps[..., rows, columns]
 
     def resize(self, maps: Float[Tensor, "n c h w"], target: "Window") -> Float[Tensor, "n c h2 w2"]:
-        """Maps of this window, resized bilinearly as ``F.interpolate`` with ``align_corners=True``.
-
-        Weights are those of whole maps.
+        """Resize maps of this window bilinearly, with the weights of ``F.interpolate`` with
+        ``align_corners=True`` on whole maps.
 
         Args:
-            maps: of this window.
-            target: a window of maps of another size, or of the same.
+            maps: maps of this window.
+            target: window of maps of another size, or of the same.
         """
         if self.full == target.full:
             return self.cut(maps, target)
         if self.is_whole and target.is_whole:
             return F.interpolate(maps, target.full, mode="bilinear", align_corners=True)
-        resized = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost
+        resized = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost in memory
         for axis, source, wanted in zip((1, 2), self, target, strict=True):
             resized = _interpolate(resized, axis, source, wanted)
         return resized.permute(0, 3, 1, 2).to(maps.dtype)
 
 
 def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
-    """Linear interpolation along one axis, with the weights of ``F.interpolate``.
-
-    Args:
-        maps: [n, h, w, c], float32 or wider.
-        axis: 1 or 2.
-        source: cells of the maps.
-        target: cells of the result.
-    """
+    """Interpolate maps [n, h, w, c] linearly along axis 1 or 2, with the weights of ``F.interpolate``."""
     low, high, weight = _sources(source, target, maps.dtype, maps.device)
     weight = weight.view(-1, *[1] * (3 - axis))
     below, above = (maps.index_select(axis, cell) for cell in (low, high))
     return torch.lerp(below, above, weight) if torch.is_grad_enabled() else below.lerp_(above, weight)
 
 
-@lru_cache(maxsize=1024)  # on a GPU windows begin at patches, so that few differ
-@torch.inference_mode(False)  # the cached tensors may be used with a gradient later
+@lru_cache(maxsize=1024)  # on a GPU windows start at patches, so there are few different ones
+@torch.inference_mode(False)  # a later use may need gradients
 def _sources(
     source: Span, target: Span, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """For each cell of the target, the two cells of the source that it lies between.
-
-    Args:
-        source: cells that there are.
-        target: cells of another map.
-        dtype: of the weights: that of the maps.
-        device: of the result.
-
-    Returns:
-        Indices of the first and of the second cell within the source, and the weight of the second.
-    """
+    """Indices within ``source`` of the two cells that each target cell lies between, and the weight of
+    the second."""
     numbers, place, low, high, weight = _of_whole_maps(source.full, target.full, dtype, device)
     wanted = slice(target.start, target.stop)
     low = low[wanted]
@@ -164,7 +141,7 @@ def _sources(
     weight = weight[wanted]
     first = numbers[target.start]
     last = min(numbers[target.stop - 1] + 1, source.full - 1)
-    if first < source.start or last >= source.stop:  # the window ends before its neighbours do
+    if first < source.start or last >= source.stop:  # neighbours lie outside the window
         low = low.clamp(source.start, source.stop - 1)
         high = (low + 1).clamp(max=source.stop - 1)
         weight = place[wanted] - low
@@ -172,24 +149,15 @@ def _sources(
 
 
 @lru_cache(maxsize=256)
-@torch.inference_mode(False)  # the cached tensors may be used with a gradient later
+@torch.inference_mode(False)  # a later use may need gradients
 def _of_whole_maps(
     source: int, target: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[list[int], Tensor, Tensor, Tensor, Tensor]:
-    """:func:`_sources` of whole maps.
+    """:func:`_sources` of whole maps with ``source`` and ``target`` cells.
 
-    Args:
-        source: number of cells that there are.
-        target: number of cells of another map.
-        dtype: of the weights: that of the maps.
-        device: of the result.
-
-    Returns:
-        For each of the target's cells the first of the two cells around it, as a number that is
-        known without a device-to-host synchronisation; its place; the first and the second cell; and
-        the weight of the second.
-    """
-    # A division and a product, both rounded to the precision of the maps, as in PyTorch.
+    Returns for each target cell: the first source cell (as a list on the host), its position, the first
+    and the second source cell, and the weight of the second."""
+    # Division and product are both rounded to the dtype of the maps, as in PyTorch.
     step = torch.tensor((source - 1) / max(target - 1, 1), dtype=dtype, device="cpu").item()
     numbers = (torch.arange(target, dtype=dtype, device="cpu") * step).long().tolist()
     place = torch.arange(target, dtype=dtype, device=device) * step
@@ -198,12 +166,7 @@ def _of_whole_maps(
 
 
 def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Window | None]:
-    """The bounding window of the mask of each image, None if empty.
-
-    Args:
-        extents: of the masks.
-        size: height and width of the images in pixels.
-    """
+    """Bounding window of the mask of each image, None if it is empty; ``size`` is height and width."""
     height, width = size
     return [
         Window(Span(top, bottom, height), Span(left, right, width)) if count else None
@@ -212,6 +175,6 @@ def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Wi
 
 
 def reach(*modules: nn.Module) -> int:
-    """Number of cells on each side that the result of these consecutive layers depends on."""
+    """Radius in cells of the receptive field of consecutive layers."""
     layers = itertools.chain.from_iterable(module.modules() for module in modules)
     return sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))

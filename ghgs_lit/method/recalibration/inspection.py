@@ -1,4 +1,4 @@
-"""Attention weights and neighbours for inspection; training does not use them."""
+"""Inspection of attention weights and neighbours; not used by predictions."""
 
 import copy
 from collections.abc import Iterator
@@ -17,8 +17,9 @@ from ghgs_lit.types import Points, Tokens
 
 @dataclass(frozen=True)
 class TokenAttention:
-    """A token, its neighbours (nearest first), and their weights in every layer and head;
-    ``plain``: the weights for s = 1. ``query`` and ``neighbors`` are indices of packed tokens."""
+    """A token, its neighbours (nearest first), and their weights in every layer and head.
+
+    ``query`` and ``neighbors`` are indices of packed tokens; ``plain``: weights for s = 1."""
 
     query: int
     neighbors: Int[Tensor, " k"]
@@ -30,16 +31,13 @@ class TokenAttention:
 def attention_of(
     recalibration: Recalibration, tokens: Tokens, points: Points, query: int
 ) -> TokenAttention | None:
-    """Attention of one token (Eqs. 3 to 5).
+    """Neighbours and attention weights of one token (Eqs. 3 to 5); None if it is not recalibrated.
 
     Args:
         recalibration: the stage.
-        tokens: inputs of the stage, as is the next.
-        points: of these tokens.
+        tokens: input of the stage.
+        points: points of these tokens.
         query: index of the packed token.
-
-    Returns:
-        Its neighbours and weights; None if the token is not recalibrated.
     """
     takes_part = recalibration.takes_part(points)
     if not takes_part[query]:
@@ -55,10 +53,15 @@ def attention_of(
 
 @dataclass(frozen=True)
 class Overlap:
-    """Neighbourhood size in an element. ``tokens``: number that take part. ``neighbors``: of each,
-    itself included. ``shared``: share of the neighbours that stay the same in the other setting of
-    ``recalibration.neighborhood``; with nearly all tokens as neighbours that is nearly 1, and the
-    ablation of 3D unprojection hardly changes anything."""
+    """Neighbourhoods of an element's tokens.
+
+    Attributes:
+        tokens: number of recalibrated tokens.
+        neighbors: number of neighbours of each, including itself.
+        shared: fraction of the neighbours that are the same with the other value of
+            ``recalibration.neighborhood``. With nearly all tokens as neighbours it is close to 1, and
+            the ablation of 3D unprojection hardly changes anything.
+    """
 
     tokens: int
     neighbors: int
@@ -67,15 +70,12 @@ class Overlap:
 
 @torch.no_grad()
 def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[Overlap]:
-    """The neighbourhood of each element.
+    """Compare the neighbourhoods of each element with those of the other ``neighborhood`` setting.
 
     Args:
         recalibration: the stage.
-        tokens: inputs of the stage, as is the next.
-        points: of these tokens.
-
-    Returns:
-        One for each element of the batch.
+        tokens: input of the stage.
+        points: points of these tokens.
     """
     other = copy.copy(recalibration)
     other.neighborhood = "image_plane" if recalibration.neighborhood == "xyz" else "xyz"
@@ -92,21 +92,18 @@ def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) 
     return results
 
 
-#: A stage with its inputs, as :func:`neighborhoods` takes them.
+#: Arguments of :func:`neighborhoods`: a stage and its inputs.
 Call = tuple[Recalibration, Tokens, Points]
 
 
 @contextmanager
 def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
-    """Collects the inputs of the stage's calls within the context.
+    """Collect the inputs of the stage's calls within the context, appended to the yielded list.
 
-    Nothing is computed, so that measured run times are unaffected.
+    Nothing is computed, so measured run times are unaffected.
 
     Args:
-        recalibration: the stage; None, or one without neighbours: the list stays empty.
-
-    Yields:
-        A list to which the inputs of each call are appended.
+        recalibration: the stage; for None, or one without neighbours, the list stays empty.
     """
     calls: list[Call] = []
     if not isinstance(recalibration, Recalibration):
@@ -127,19 +124,8 @@ def _weights(
     rows: slice,
     plain: bool = False,
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "L m k a"]]:
-    """Neighbours and attention weights of some tokens of an element.
-
-    Args:
-        recalibration: the stage.
-        tokens: inputs of the stage, as is the next.
-        points: of these tokens.
-        chosen: indices of the n packed tokens that take part.
-        rows: which m of these are queries.
-        plain: weights for s = 1.
-
-    Returns:
-        Neighbours of all chosen ones, as indices among them [n, k], and weights [L, m, k, a].
-    """
+    """Neighbours [n, k] of the ``chosen`` tokens of an element, as indices into these, and attention
+    weights [L, m, k, a] of the queries ``rows``; ``plain``: weights for s = 1."""
     near, cosines, *_ = recalibration.neighborhood_of(tokens, points, chosen)
     block = recalibration.block
     changes = [values if values is None else values[rows] for values in block.factor_and_bias(cosines)]

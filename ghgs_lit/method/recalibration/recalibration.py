@@ -19,35 +19,34 @@ from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neigh
 from ghgs_lit.ops.pool import in_parts
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 
-#: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
+#: Effect of the similarity of two tokens on their logit; see :class:`SemanticAttention`.
 Similarity = Literal["product", "product_clamped", "log", "none"]
 
-#: The smallest similarity with ``log``, as its logarithm would be infinite at 0.
+#: Lower limit of the similarity with ``log``, since the logarithm is infinite at 0.
 S_MIN = 0.01
 
-#: Tokens computed at once on a CPU without a gradient.
+#: Largest number of tokens computed at once on a CPU without a gradient.
 _ROWS = 424
 
 
 class RecalibrationOptions(Options):
-    """Tokens to tokens by multi-view semantic consistency (paper, Eqs. 3 to 5)."""
+    """Recalibration of tokens by multi-view semantic consistency (paper, Eqs. 3 to 5)."""
 
     group = "recalibration"
     k: Count | Annotated[float, Field(gt=0, lt=1)] = 64
-    """Neighbours of each token: a number (64 in the authors' release; all tokens where there are
-    fewer), or a share of the subject's tokens that take part, such as 0.1, which means the same at
-    every size."""
+    """Neighbours of each token: a number (64 in the authors' release; all tokens if there are fewer), or
+    a fraction of the recalibrated tokens, such as 0.1, which is independent of the image size."""
     num_heads: Width = 8
-    """Attention heads; they divide a quarter of the token width. 8 in the release."""
+    """Attention heads, which must divide a quarter of the token width; 8 in the release."""
     similarity: Similarity = "product"
-    """How the cosine s of semantic features acts on a logit: product (s times it: Eq. 3) |
-    product_clamped (max(s, 0) times it: the release) | log (adds log(max(s, 0.01))) | none
-    (ablation: s = 1)"""
+    """Effect of the cosine s of semantic features on a logit: product: multiply by s (Eq. 3) |
+    product_clamped: multiply by max(s, 0) (the release) | log: add log(max(s, 0.01)) | none: s = 1
+    (ablation)"""
     neighborhood: Literal["xyz", "image_plane"] = "xyz"
-    """Where distances are measured: xyz, between 3D points of tokens | image_plane, between centres
-    of tokens in pixels, as if all views were one (ablation: no unprojection)"""
+    """Space in which distances are measured: xyz: between 3D points of tokens | image_plane: between
+    centres of patches in pixels, as if all views were one (ablation: no unprojection)"""
     tokens: Literal["subject", "all"] = "subject"
-    """Tokens that take part: subject, those with a point on the subject | all (the release)"""
+    """Recalibrated tokens: subject: those with a point on the subject | all (the release)"""
     positions: Literal["none", "relative"] = "none"
     """Positional information in the attention values: none (the paper) | relative: offset of each
     neighbour from the token, in units of the subject (not in the paper; with neighborhood=xyz)"""
@@ -59,7 +58,7 @@ class RecalibrationOptions(Options):
         return self
 
     def build(self, dim_latent: int) -> "Recalibration":
-        """The stage with new weights for tokens of width ``dim_latent``.
+        """Build the stage with new weights for tokens of width ``dim_latent``.
 
         Raises:
             InputError: as :class:`SemanticAttention`.
@@ -72,9 +71,9 @@ class Neighborhood(NamedTuple):
 
     Attributes:
         near: neighbours of each token, as indices into the n tokens.
-        cosines: of the semantic features of token and neighbour; None: similarity is ignored (s = 1).
+        cosines: cosines of the semantic features of token and neighbour; None: s = 1.
         left_out: added to the logits: -inf for an invalid neighbour, else 0; None: all are valid.
-        places: of the tokens, in units of the subject; None: values do not depend on places.
+        places: positions of the tokens in units of the subject; None: values do not depend on them.
     """
 
     near: Int[Tensor, "n k"]
@@ -92,7 +91,7 @@ class SemanticAttention(nn.Module):
         similarity: effect of the cosine s of two tokens' semantic features on the logit:
             ``product`` multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors'
             release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar
-            neighbours instead of pulling their logit to 0, ``none`` ignores it (s = 1).
+            neighbours instead of moving their logit towards 0, ``none`` ignores it (s = 1).
         has_places: whether the value of a neighbour also depends on its position relative to the query,
             by a linear map of the difference that is initialised to 0 (not in the paper). By
             linearity that equals the map of a head's mean position minus the query's, which needs
@@ -123,11 +122,11 @@ class SemanticAttention(nn.Module):
             nn.init.zeros_(self.place_proj.weight)
 
     def forward(self, x: Float[Tensor, "n C"], neighborhood: Neighborhood) -> Float[Tensor, "n C"]:
-        """Recalibrated tokens (Eqs. 3 and 5): keys and values of all first, then the tokens in parts.
+        """Recalibrate tokens (Eqs. 3 and 5): keys and values of all first, then the tokens in parts.
 
         Args:
             x: tokens of one or several elements.
-            neighborhood: of these tokens.
+            neighborhood: neighbourhood of these tokens.
         """
         near, cosines, left_out, places = neighborhood
         factor, bias = self.factor_and_bias(cosines)
@@ -157,10 +156,10 @@ class SemanticAttention(nn.Module):
         return in_parts(recalibrate, len(x), most)
 
     def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> tuple[Tensor | None, Tensor | None]:
-        """Factor and summand of the logits due to the semantic similarity; None: no change.
+        """Factor and summand of the logits due to semantic similarity; None: no change.
 
         Args:
-            cosines: of tokens and neighbours, in [-1, 1]; None: similarity is ignored (s = 1).
+            cosines: cosines of tokens and neighbours, in [-1, 1]; None: s = 1.
         """
         if cosines is None:
             return None, None
@@ -169,12 +168,12 @@ class SemanticAttention(nn.Module):
         return cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines, None
 
     def _with_places(self, v: Float[Tensor, "n i"], places: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
-        """Values, with the token's position appended to the channels of each head, j = i + 3 a."""
+        """Append the token's position to the channels of each head's values, j = i + 3 a."""
         heads = v.unflatten(1, (self.num_heads, -1))
         return torch.cat((heads, places[:, None].expand(-1, self.num_heads, -1)), dim=-1).flatten(1)
 
     def _moved(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
-        """Weighted values of :meth:`_with_places`, plus the contribution of the neighbours' positions."""
+        """Replace the mean positions in weighted values by their contribution, relative to the queries'."""
         values, mean = y.unflatten(1, (self.num_heads, -1)).tensor_split([-3], dim=-1)
         weight = self.place_proj.weight.to(y.dtype).unflatten(0, (self.num_heads, -1))
         with exact(y.device.type):
@@ -193,15 +192,13 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity, self.has_places)
 
     def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
-        """Tokens with recalibrated layers; semantic features and order are unchanged.
+        """Recalibrate the layers of tokens; shapes, dtypes, semantic features and order are unchanged.
 
         Args:
-            tokens: of the encoder.
-            points: of these tokens in the subject's frame.
-            plan: tokens in ``peers`` take part if their points are valid, or always with ``tokens="all"``.
-
-        Returns:
-            Tokens of the same shapes and precision.
+            tokens: tokens of the encoder.
+            points: points of these tokens in the subject's frame.
+            plan: tokens in ``peers`` are recalibrated if their points are valid, or always with
+                ``tokens="all"``.
         """
         rows = plan.peers.only(self.takes_part(points))
         neighborhoods = [self.neighborhood_of(tokens, points, *table) for table in rows.tables]
@@ -221,13 +218,13 @@ class Recalibration(nn.Module):
         index: Int[Tensor, "*g n"],
         real: Bool[Tensor, "*g n"] | None = None,
     ) -> Neighborhood:
-        """Neighbours that tokens of one or several elements attend to (Eq. 4).
+        """Find the neighbours that tokens of one or several elements attend to (Eq. 4).
 
         Args:
-            tokens: of the encoder.
-            points: of these tokens.
-            index: of the tokens, by element.
-            real: which of these are valid; no token attends to the others. None: all.
+            tokens: tokens of the encoder.
+            points: points of these tokens.
+            index: indices of the tokens to recalibrate, by element.
+            real: which of these are valid; the others are never attended to. None: all.
         """
         n = index.shape[-1]
         places = None
@@ -258,43 +255,32 @@ class Recalibration(nn.Module):
         return Neighborhood(near.flatten(0, -2), cosines, left_out, places)
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
-        """Tokens that are recalibrated and can be neighbours."""
+        """Mask of the tokens that are recalibrated and can be neighbours."""
         valid = points.tokens_valid
         return valid if self.tokens == "subject" else torch.ones_like(valid)
 
     def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
-        """Position of each token in the space where neighbours are searched; see ``neighborhood``.
-
-        Args:
-            tokens: of the encoder.
-            points: of these tokens.
-
-        Returns:
-            [N, 3] in the frame, or [N, 2] in pixels (row, column); without a gradient.
-        """
+        """Position of each token in the space in which neighbours are searched, without a gradient:
+        [N, 3] in the frame, or [N, 2] in pixels (row, column)."""
         if self.neighborhood == "xyz":
             return points.tokens.detach()
-        # Half pixels are exact in float32, so equal distances are equal numbers.
+        # Half pixels are exact in float32, so equal distances compare equal.
         return (torch.stack((tokens.row, tokens.column), dim=-1) + 0.5) * tokens.patch_size
 
     def places(self, tokens: Tokens) -> Int[Tensor, " N"] | None:
-        """``places`` for :func:`nearest_neighbors`;
-        None for 3D points, which have no systematic ties."""
+        """``places`` for :func:`nearest_neighbors`; None for 3D points, which have no systematic ties."""
         if self.neighborhood != "image_plane":
             return None
-        # Twice the columns, so that places at equal distances from a query differ in their numbers.
+        # Twice the columns, so that positions at equal distances from a query get different numbers.
         return tokens.row * 2 * tokens.grid[3] + tokens.column
 
 
 def neighbor_count(k: int | float, tokens: int) -> int:
-    """Neighbours of each of an element's tokens.
+    """Number of neighbours of each token, at least 1.
 
     Args:
-        k: number of neighbours or, below 1, a share of the tokens.
-        tokens: number of the element's tokens that take part.
-
-    Returns:
-        At least 1; a number ``k`` may exceed the number of tokens.
+        k: number of neighbours, returned even if it exceeds ``tokens``; or, below 1, a fraction.
+        tokens: number of recalibrated tokens of the element.
     """
     return max(round(k * tokens), 1) if k < 1 else int(k)
 

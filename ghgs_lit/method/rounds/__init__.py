@@ -1,4 +1,4 @@
-"""Rounds of refinement: Gaussians are compared with the input views and corrected."""
+"""Refinement rounds: Gaussians are compared with the input views and corrected."""
 
 from ghgs_lit.method.rounds.coarse import Coarse, CoarseDepths, coarse_of, coarse_sizes
 from ghgs_lit.method.rounds.rounds import NoRounds, Rounds, RoundsOptions, State, prediction_of

@@ -1,11 +1,11 @@
 """Coarse to fine: predictions from downsampled views initialise the rounds at full size.
 
 The stages have a receptive field of a fixed number of pixels. If a person is taller than in
-training, the field covers less of it and depths are less accurate. So the whole method runs once
-on copies in which the subject has the height of the training. Its depths are refined at full size, as in
-cascades of cost volumes (CasMVSNet, Gu et al., CVPR 2020), and its tokens are those of the encoder
-at full size, which does not run there. All decisions depend only on an element's own masks and
-the size of the images.
+training, the field covers less of them, and depths are less accurate. So the whole method runs once
+on downsampled copies in which the subject has the height of the training. The resulting depths are
+refined at full size, as in cascades of cost volumes (CasMVSNet, Gu et al., CVPR 2020), and the
+resulting tokens replace those of the encoder, which does not run at full size. All decisions depend
+only on an element's own masks and the size of the images.
 """
 
 import dataclasses
@@ -25,13 +25,12 @@ from ghgs_lit.geometry.projection import at_least_float32, pixel_centers
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens, map_tensors
 
-#: Share of an image's side that a person fills in training.
-#: In images of that size nothing changes.
+#: Fraction of an image's side that a person fills in training; images of that size are not copied.
 FILLED = 0.8
-#: First step of the rounds in depth, in those of rounds after a depth head:
-#: a coarse depth is nearly right.
+#: Factor of the rounds' first step in depth, compared with rounds after a depth head: a coarse depth
+#: is nearly right.
 STEP = 0.5
-#: Share of a pixel that a mask without a matte must cover in a smaller copy.
+#: Fraction of a pixel that a mask without a matte must cover in a downsampled copy.
 _COVERED = 0.5
 
 #: Height and width in pixels.
@@ -44,8 +43,8 @@ class CoarseDepths:
 
     Attributes:
         depth: in metres; meaningless in other elements.
-        confidence: of the coarse depth head.
-        elements: which elements have depths.
+        confidence: confidence of the coarse depth head.
+        elements: which elements have coarse depths.
     """
 
     depth: Float[Tensor, "B V H W"]
@@ -54,12 +53,12 @@ class CoarseDepths:
 
     @property
     def are_all(self) -> bool:
-        """Whether all elements have depths, so that no depth head is needed."""
+        """Whether all elements have coarse depths, so that no depth head is needed."""
         return all(self.elements)
 
     @property
     def step(self) -> float | Float[Tensor, " B"]:
-        """Size of the first step in depth of the rounds in each element, or in all."""
+        """Factor of the rounds' first step in depth, for all elements or for each."""
         if self.are_all:
             return STEP
         steps = tuple(STEP if known else 1.0 for known in self.elements)
@@ -67,16 +66,16 @@ class CoarseDepths:
 
     @property
     def known(self) -> Bool[Tensor, " B"]:
-        """Which elements have depths, on their device."""
+        """:attr:`elements` as a tensor on the depths' device."""
         return constant(torch.tensor, self.elements, like=self.depth, dtype=torch.bool)
 
     def maps(self, batch: Batch, bounds: DepthBounds, others: DepthMaps | None = None) -> DepthMaps:
-        """The depths within bounds; the middle of the bounds where depth is unknown.
+        """Clamp the depths to bounds; unknown ones become the middle of the bounds.
 
         Args:
             batch: its masks define the valid pixels.
             bounds: in metres.
-            others: depths of the elements without coarse ones; None: all elements have some.
+            others: depths of the elements without coarse ones; None: all elements have coarse depths.
         """
         depth = torch.where(self.depth > 0, self.depth, (bounds.near + bounds.far) / 2)
         depth = torch.minimum(torch.maximum(depth, bounds.near), bounds.far)
@@ -93,31 +92,25 @@ class CoarseDepths:
 
 @dataclass(frozen=True)
 class Coarse:
-    """Results of predictions from downsampled views that are used at full size.
+    """Results of predictions from downsampled views for use at full size.
 
     Attributes:
-        depths: of the elements that have copies.
-        tokens: of every patch at full size, from the encoder's of the copies;
-            meaningless in other elements.
+        depths: depths of the elements that have downsampled copies.
+        tokens: tokens of every patch at full size, interpolated from those of the copies; meaningless
+            in other elements.
     """
 
     depths: CoarseDepths
     tokens: Tokens
 
     def encoder(self, encoder: Callable[..., Tokens]) -> Callable[..., Tokens]:
-        """An encoder that returns the tokens of the copies for elements that have one.
-
-        Args:
-            encoder: of all other elements; called only if there are any.
-        """
+        """Wrap an encoder: elements with a copy use its tokens; ``encoder`` is called only if there are
+        others."""
         return functools.partial(self._encoded, encoder)
 
     def depth_head(self, head: Callable[..., DepthMaps]) -> Callable[..., DepthMaps]:
-        """A depth head that returns the depths of the copies for elements that have one.
-
-        Args:
-            head: of all other elements; called only if there are any.
-        """
+        """Wrap a depth head: elements with a copy use its depths; ``head`` is called only if there are
+        others."""
         return functools.partial(self._decoded, head)
 
     def _decoded(
@@ -159,16 +152,14 @@ def coarse_of(
     least_matte: float | None,
     predict: Callable[[Batch], Prediction],
 ) -> Coarse | None:
-    """Predictions from downsampled views;
-    None if no subject is taller than in training.
+    """Predict from downsampled views; None if no subject is taller than in training.
 
     Args:
-        batch: preprocessed, with or without a border around the images.
-        height: the subject's height in training in pixels, or its width if larger.
-        patch_size: of the encoder, in pixels; sides of the copies are its multiples.
-        least_matte: share of a pixel above which it belongs to the subject, 0 to 0.5; None:
-            no mattes.
-        predict: returns the prediction of a batch, with the tokens of the encoder.
+        batch: preprocessed, with or without padding.
+        height: height of the subject in training in pixels, or its width if larger.
+        patch_size: patch size of the encoder in pixels; sides of the copies are its multiples.
+        least_matte: matte above which a pixel belongs to the subject, 0 to 0.5; None: no mattes.
+        predict: predicts from a batch, and returns the tokens of the encoder as well.
 
     Returns:
         Depths in metres and tokens at the size of ``batch``.
@@ -198,15 +189,15 @@ def coarse_of(
 
 
 def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:
-    """The size of each element's smaller copy; None for elements that need none.
+    """Size of each element's downsampled copy; None for elements that need none.
 
     A copy is needed if the subject is taller than in training and the images are larger than those of
     the training, which subjects may fill. Each element is decided independently.
 
     Args:
-        batch: images of one size, with or without a border.
-        height: the subject's height in training, in pixels.
-        patch_size: sides are its multiples, in pixels.
+        batch: images of one size, with or without padding.
+        height: height of the subject in training, in pixels.
+        patch_size: in pixels; sides of the copies are its multiples.
     """
     photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
     views, *full = photographs.masks.shape[1:]
@@ -225,15 +216,15 @@ def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None
 
 
 def spread_tokens(tokens: Tokens, batch: Batch, patch_size: int) -> Float[Tensor, "b V h w c"]:
-    """Tokens of smaller copies for every patch at full size, interpolated bilinearly among existing ones.
+    """Interpolate tokens of downsampled copies bilinearly, among existing ones, for every patch at full size.
 
     Args:
-        tokens: of the copies of some elements.
-        batch: at full size, with or without a border.
+        tokens: tokens of the copies of some elements.
+        batch: at full size, with or without padding.
         patch_size: of the encoder, in pixels.
 
     Returns:
-        The layers and the semantic features, one after another; 0 where no token is near.
+        Concatenated layers and semantic features; 0 where no token is near.
     """
     ones = torch.ones_like(tokens.semantic[:, :1])
     rows = torch.cat((*tokens.latent, tokens.semantic, ones), -1)
@@ -252,12 +243,8 @@ def spread_tokens(tokens: Tokens, batch: Batch, patch_size: int) -> Float[Tensor
 
 
 def _packed(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
-    """Tokens of every patch.
-
-    Args:
-        rows: layers and semantic features, one after another.
-        like: has widths, dtypes and the patch size.
-    """
+    """Build tokens of every patch from concatenated layers and semantic features, with the widths and
+    dtypes of ``like``."""
     grid = tuple(rows.shape[:4])
     parts = (*like.latent, like.semantic)
     split = rows.flatten(0, 3).split([part.shape[1] for part in parts], -1)
@@ -269,12 +256,12 @@ def _packed(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
 
 
 def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
-    """The batch with downsampled images, mattes and masks, and their cameras.
+    """Downsample images, mattes, masks and cameras of a batch; true depths and targets are dropped.
 
     Args:
-        batch: images without a border; true depths and targets are left out.
+        batch: images without padding.
         size: height and width of the copies, in pixels.
-        least_matte: share of a pixel above which it belongs to the subject, with mattes."""
+        least_matte: matte above which a pixel belongs to the subject, for batches with mattes."""
     images = _resized(at_least_float32(batch.images).flatten(0, 1), size).unflatten(0, batch.masks.shape[:2])
     shares = _resized(coverage(batch), size).clamp(0, 1)
     has_matte = batch.alpha is not None
@@ -290,19 +277,17 @@ def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
 
 
 def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
-    """Depths at another size. Inverse depths are interpolated, which is exact for planes.
+    """Resample depths in metres to another size; 0 where no valid depth is near.
+
+    Inverse depths are interpolated, which is exact for planes.
 
     Args:
-        maps: depths in metres, and where they are valid.
+        maps: depths in metres and their validity.
         size: height and width in pixels.
-
-    Returns:
-        Depths in metres, 0 where no valid depth is near.
     """
     depth = at_least_float32(maps.depth)
     inverse = torch.where(maps.valid, 1 / torch.where(maps.valid, depth, 1), 0)
-    # One pixel around known depths: a finger may lie within the full-size mask and
-    # outside the copy's.
+    # Extend depths by one pixel: a finger may lie in the full-size mask but not in the copy's.
     weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
     inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
     weight = _resized((weight > 0).to(depth.dtype), size)
@@ -315,6 +300,6 @@ def _resized(maps: Float[Tensor, "B c H W"], size: Size) -> Float[Tensor, "B c h
 
 
 def _elements(batch: Batch, chosen: Tensor) -> Batch:
-    """Input views of some elements, without targets and true depths."""
+    """Select the input views of some elements, without targets and true depths."""
     alone = dataclasses.replace(batch, targets=None, depths=None, body_vertices=None, subjects=(), views=())
     return map_tensors(alone, lambda values: values[chosen])

@@ -1,4 +1,4 @@
-"""Feature exchange among Gaussians of neighbouring pixels between rounds."""
+"""Feature exchange among the Gaussians of neighbouring pixels between rounds."""
 
 import math
 from functools import lru_cache
@@ -14,8 +14,7 @@ from ghgs_lit.method.heads.gaussian import RawGaussians
 from ghgs_lit.ops.linear import Linear
 from ghgs_lit.types import Batch
 
-#: Side in pixels of the square around a Gaussian's pixel whose Gaussians it exchanges
-#: features with.
+#: Side in pixels of the square window of neighbours whose features a Gaussian receives.
 SIDE = 5
 
 
@@ -23,9 +22,9 @@ class Windows(NamedTuple):
     """Positions of Gaussians in maps cropped to the subject of each image.
 
     Attributes:
-        place: index among the pixels of all maps.
+        place: flat index among the pixels of all maps.
         shape: number, height and width of the maps.
-        spare: 1 if rows that are no Gaussian have a place behind all pixels, else 0.
+        spare: 1 if invalid rows use an extra index after all pixels, else 0.
     """
 
     place: Int[Tensor, " N"]
@@ -34,12 +33,11 @@ class Windows(NamedTuple):
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Windows":
-        """Positions in maps of the size of the largest subject,
-        each of which begins at its own subject.
+        """Positions in maps of the size of the largest subject, each starting at its own subject.
 
         Args:
-            raw: Gaussians of the batch, with the pixels that they belong to.
-            batch: its extents are read, or known from a plan.
+            raw: Gaussians of the batch with their pixels.
+            batch: its extents are used, read from the device unless a plan has done so.
         """
         filled = [extent for extent in batch.extents if extent.count]
         height = max((extent.bottom - extent.top for extent in filled), default=1)
@@ -60,28 +58,27 @@ class Windows(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # a training step may have them in its graph
+@torch.inference_mode(False)  # a later use may need gradients
 def _on_device(numbers: tuple, device: torch.device) -> Tensor:
-    """Numbers of the host; a captured graph finds them where they are."""
+    """Cached device copy of host numbers, whose address captured graphs can rely on."""
     return torch.tensor(numbers).to(device, non_blocking=True)
 
 
 class Exchange(nn.Module):
-    """Adds features of neighbouring pixels' Gaussians to the features of each;
-    untrained, it adds nothing.
+    """Adds features of neighbouring pixels' Gaussians to those of each Gaussian; initially adds 0.
 
-    If several depths explain a colour, neighbours decide, as in recurrent networks of optical flow
-    (RAFT, Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap.
+    If several depths explain a colour, neighbours disambiguate, as in recurrent networks for optical
+    flow (RAFT, Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap.
 
     Args:
-        width: of the features.
-        channels: of the features that are exchanged.
+        width: channels of the features.
+        channels: channels of the exchanged features.
     """
 
     def __init__(self, width: int, channels: int):
         super().__init__()
         self.tell = Linear(width, channels)
-        # Channels last is several times as fast on a CPU, and the layout of rows of Gaussians.
+        # Channels last is the layout of rows of Gaussians, and several times as fast on a CPU.
         self.across = nn.Conv2d(channels, channels, SIDE, padding=SIDE // 2).to(
             memory_format=torch.channels_last
         )
@@ -90,11 +87,11 @@ class Exchange(nn.Module):
         nn.init.zeros_(self.hear.bias)
 
     def forward(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N w"]:
-        """Features with those of the neighbours added.
+        """Add the neighbours' features.
 
         Args:
             known: features of each Gaussian.
-            windows: places of the Gaussians.
+            windows: positions of the Gaussians.
         """
         sent = self.tell(known)
         size = math.prod(windows.shape)

@@ -1,6 +1,7 @@
-"""Photometric differences between cameras: gains (exposure or white balance) and gammas. A point on
-the surface has the same colour in all views that see it, up to a gain of each camera and channel
-(as for panoramas: Brown and Lowe, IJCV 2007)."""
+"""Photometric differences between cameras: gains (exposure or white balance) and gammas.
+
+A point on the surface has the same colour in all views that see it, up to a gain per camera and
+channel (as in panoramas: Brown and Lowe, IJCV 2007)."""
 
 import dataclasses
 import itertools
@@ -17,23 +18,21 @@ from ghgs_lit.method.rounds.observation import looked_up
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Gaussians
 
-#: Distance in metres from a view's rendered surface at which a Gaussian's weight in that
-#: view is 1 / e.
+#: Distance in metres from a view's rendered surface at which a Gaussian's weight in that view is 1 / e.
 _NEAR = 0.02
-#: Colours closer than this to black or white have less weight: they constrain a gain little.
+#: Colours closer than this to black or white get less weight, since they constrain a gain little.
 _DARK = 0.05
-#: Deviation of log colours from the gains at which a Gaussian has half its weight: wrong depths,
-#: shadows.
+#: Residual of log colours at which a Gaussian's weight is halved (wrong depths, shadows).
 _OUTLIER = 0.15
-#: Log gains well below this are probably errors of the estimate, and shrunk towards 0.
+#: Log gains well below this are probably estimation errors, and are shrunk towards 0.
 _LEAST = 0.02
-#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these. For gammas it
-#: is one whose brightness is a tenth from the mean.
+#: Weight of the prior (gains of 1) in Gaussians, which decides for views that share no surface. For
+#: gammas: one Gaussian whose log brightness is 0.1 from the mean.
 _PRIOR = 1.0
 _PRIOR_OF_SLOPES = 0.1**2
-#: One Gaussian in this many is compared: a third is enough and takes a third of the time.
+#: Stride over Gaussians: a third of them is enough and takes a third of the time.
 _EVERY = 3
-#: Steps of reweighting, and of that of slopes, which begins farther away.
+#: Iterations of reweighting, for gains and for gammas, which start farther from the solution.
 _STEPS = 5
 _STEPS_OF_SLOPES = 15
 
@@ -42,15 +41,15 @@ Real = Bool[Tensor, " N"] | None
 
 
 def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
-    """Gaussians and input views, divided by the gains of their cameras.
+    """Estimate the gains of the cameras, and divide Gaussians' colours and input images by them.
 
     Args:
-        gaussians: of the batch, with the pixels that they belong to.
-        batch: whose images are compared.
+        gaussians: Gaussians of the batch with their pixels.
+        batch: the input views.
         real: which rows are Gaussians; None: all.
 
     Returns:
-        Gaussians with other colours, and the batch with corrected images and its ``log_gains``.
+        Gaussians with corrected colours, and the batch with corrected images and ``log_gains``.
     """
     logs = log_gains(gaussians, batch, real)
     colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
@@ -58,10 +57,10 @@ def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Ga
 
 
 def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
-    """The batch with photographs divided by gains, within [0, 1].
+    """Divide images by gains, and clamp them to [0, 1].
 
     Args:
-        batch: with photographs as they were taken.
+        batch: with uncorrected images.
         logs: natural logarithms of the gains of each camera and channel.
     """
     images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
@@ -70,15 +69,15 @@ def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
 
 @torch.no_grad()
 def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of each camera's gains; 0 if views share nothing.
+    """Estimate natural logarithms of each camera's gains; 0 if views share no surface.
 
     Their mean is about 0, as images do not determine which camera is right. Pairs of views are
-    compared at the Gaussians that both see, with Cauchy weights, so that wrong depths matter little
+    compared at the Gaussians visible in both, with Cauchy weights, so that wrong depths matter little
     (gain compensation; Brown and Lowe, IJCV 2007).
 
     Args:
-        gaussians: of the batch, with the pixels that they belong to.
-        batch: whose images are compared.
+        gaussians: Gaussians of the batch with their pixels.
+        batch: the input views.
         real: which rows are Gaussians; None: all.
     """
     with exact(gaussians.means.device.type):
@@ -96,16 +95,16 @@ def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Te
 
 @torch.no_grad()
 def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of cameras' gammas relative to the median camera's;
-    about 0 if views share nothing.
+    """Estimate natural logarithms of cameras' gammas relative to the median camera's; about 0 if views
+    share no surface.
 
-    A gamma is the exponent of a camera's colours. Where those of two views differ, log ratios of
-    their colours change as much with log brightness, while gains only shift them: lines are fitted
-    to these, with Cauchy weights.
+    A gamma is the exponent of a camera's colours. If two views differ in gamma, log ratios of their
+    colours change linearly with log brightness, while gains only shift them: lines are fitted to these,
+    with Cauchy weights.
 
     Args:
-        gaussians: of the batch, with the pixels that they belong to.
-        batch: whose images are compared.
+        gaussians: Gaussians of the batch with their pixels.
+        batch: the input views.
     """
     with exact(gaussians.means.device.type):
         own, logs, theirs, weights = _compared(gaussians, batch)
@@ -126,19 +125,13 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
 
 
 def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]) -> Float[Tensor, "k I V 3"]:
-    """Sums of values over the Gaussians of each image.
-
-    Args:
-        own: number of the image (``b * V + v``) of each Gaussian.
-        images: number I of images.
-        values: k tensors.
-    """
+    """Sum each of k values over the Gaussians of each of I images; ``own`` is each Gaussian's image."""
     stacked = torch.stack(values)
     return stacked.new_zeros(len(values), images, *stacked.shape[2:]).index_add_(1, own, stacked)
 
 
 def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
-    """One of :data:`_EVERY` Gaussians of each element, and their indices."""
+    """Select every :data:`_EVERY`-th Gaussian of each element; returns them and their indices."""
     device = gaussians.means.device
     splits = gaussians.splits
     ends = list(itertools.accumulate(splits))
@@ -150,17 +143,10 @@ def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
 def _compared(
     gaussians: Gaussians, batch: Batch, real: Real = None
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
-    """Colours of some Gaussians in the views that see them.
+    """Sample the colours of some Gaussians in all views.
 
-    Args:
-        gaussians: of the batch, with the pixels that they belong to.
-        batch: whose images are compared.
-        real: which rows are Gaussians; None: all.
-
-    Returns:
-        Number of each Gaussian's own image, logs of their colours in each view and in their own,
-        and weights from 0 to 1.
-    """
+    Returns the image of each Gaussian, log colours in each view and in its own, and weights in [0, 1],
+    0 where it is not visible."""
     depth = render(gaussians, batch.cameras).depth
     views = batch.masks.shape[1]
     gaussians, index = _thinned(gaussians)
@@ -183,12 +169,12 @@ def _compared(
 def _solved(
     counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"], prior: float = _PRIOR
 ) -> Float[Tensor, "B V 3"]:
-    """Logs of each view that best fit the differences of pairs of views.
+    """Least-squares logs of each view from differences between pairs of views.
 
     Args:
         counts: sums of weights at the Gaussians of own views (first V) in other views (last V).
-        differences: weighted sums of the logs of views (last V) less those of own views (first V).
-        prior: weight of logs of 0.
+        differences: weighted sums of logs of other views (last V) minus those of own views (first V).
+        prior: weight of the prior that logs are 0.
     """
     counts = counts.movedim(-1, 1)
     differences = differences.movedim(-1, 1)
@@ -196,5 +182,5 @@ def _solved(
     identity = constant(torch.eye, both.shape[-1], like=both)
     laplacian = torch.add(identity * both.sum(-1, keepdim=True) - both, identity, alpha=prior)
     right = differences.sum(-2) - differences.sum(-1)
-    # Never singular; linalg.solve would check that and wait for a GPU.
+    # Never singular; linalg.solve would check that with a device-to-host synchronisation.
     return torch.linalg.solve_ex(laplacian, right).result.mT

@@ -1,4 +1,4 @@
-"""Values of input views and renders at the positions of Gaussians, without a gradient."""
+"""Sampling of input views and renders at the positions of Gaussians, without a gradient."""
 
 import dataclasses
 
@@ -17,10 +17,9 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, map_tensors
 #: Scale in metres of a Gaussian's distance behind the rendered surface (tanh of the ratio).
 _BEHIND = 0.05
 
-#: Values of :func:`slopes`: of the mean along its ray and its own axes, of scales,
-#: opacity and color.
+#: Channels of :func:`slopes`: mean along its ray and along the Gaussian's axes, scales, opacity, color.
 SLOPES = 1 + 3 + 3 + 1 + 3
-# Slopes saturate from about 1/4 on; most are less than a tenth.
+# Slopes saturate above about 1/4; most are below a tenth.
 _STEEP = 4.0
 
 
@@ -28,23 +27,22 @@ _STEEP = 4.0
 def slopes(
     gaussians: Gaussians, batch: Batch, directions: Float[Tensor, "N 3"], footprints: Float[Tensor, "N 1"]
 ) -> tuple[Rendering, Float[Tensor, "N s"]]:
-    """The rendered inputs, and the bounded gradient of their squared error with respect to
+    """Render the input views, and compute the bounded gradient of their squared error with respect to
     each Gaussian.
 
-    The error is of colours and mattes. Units are pixels for means, logarithms for scales, logits
+    The error is that of colours and mattes. Units are pixels for means, logarithms for scales, logits
     for opacities. No gradient flows through the values.
 
     Args:
-        gaussians: of the batch.
-        batch: whose images and mattes are compared with the renders.
-        directions: of the rays of the Gaussians' pixels.
+        gaussians: Gaussians of the batch.
+        batch: images and mattes to compare with the renders.
+        directions: directions of the rays of the Gaussians' pixels.
         footprints: size of a pixel at each Gaussian's depth, in the unit of depth.
 
     Returns:
-        Renders from the cameras of the batch,
-        and :data:`SLOPES` values of each Gaussian from -1 to 1.
+        Renders from the cameras of the batch, and :data:`SLOPES` values in [-1, 1] of each Gaussian.
     """
-    # Copies: tensors of inference mode can never have a gradient.
+    # Copies, since inference tensors cannot require gradients.
     means, scales, opacities, colors = leaves = [
         getattr(gaussians, name).detach().clone().requires_grad_()
         for name in ("means", "scales", "opacities", "colors")
@@ -74,13 +72,13 @@ def slopes(
 
 @torch.no_grad()
 def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = None) -> Float[Tensor, "N V c"]:
-    """:data:`CHANNELS` values of each Gaussian in each view: its own,
-    then the others in cyclic order.
+    """:data:`CHANNELS` values of each Gaussian in each view: its own first, then the others in cyclic
+    order.
 
     Args:
-        gaussians: of the batch, with the pixels that they belong to.
+        gaussians: Gaussians of the batch with their pixels.
         batch: images, masks, mattes and cameras are read.
-        rendering: of the Gaussians from these cameras; None: they are rendered.
+        rendering: render of the Gaussians from these cameras; None: rendered here.
     """
     with exact(gaussians.means.device.type):
         rendering = rendering or render(gaussians, batch.cameras)
@@ -93,15 +91,15 @@ def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = No
 def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
-    """Values of maps at projected means, bilinear; 0 beyond the border.
+    """Sample maps bilinearly at projected means; 0 beyond the border.
 
     Args:
-        gaussians: of B elements.
+        gaussians: Gaussians of B elements.
         cameras: [B, V], of the maps.
-        maps: of all views.
+        maps: maps of all views.
 
     Returns:
-        Values in each view, z-depths there, and whether the means are in view: inside the frame and
+        Values in each view, depths z there, and whether the means are in view: inside the frame and
         in front of the camera.
     """
     return values_at(gaussians.means, gaussians.image, gaussians.splits, cameras, maps)

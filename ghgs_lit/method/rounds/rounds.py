@@ -1,10 +1,10 @@
 """Rounds: render the input views, compare renders with images, correct the Gaussians.
 
-A single forward pass never checks its depths and attributes, although the rasterizer renders the
-inputs in milliseconds. In each round every Gaussian is compared with the images at its present
-position (:mod:`ghgs_lit.method.rounds.observation`), and a small network, the same in all rounds, moves it
-along its ray and changes its raw attributes. Learned optimizers of splats also use the errors of
-re-rendered inputs (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
+A single forward pass never verifies its depths and attributes, although the rasterizer renders the
+inputs in milliseconds. In each round, every Gaussian is compared with the images at its current
+position (:mod:`ghgs_lit.method.rounds.observation`), and a small network with shared weights moves it
+along its ray and changes its raw attributes. Learned optimizers of splats use errors of re-rendered
+inputs likewise (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -33,22 +33,21 @@ from ghgs_lit.ops.photo_consistency import consistency_of
 from ghgs_lit.ops.round_memory import remembered
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction, Tokens
 
-#: Largest distance of the depths that the first round compares from the current one, as a share of
-#: the way from near to far.
+#: Largest distance from the current depth that the first round tests, as a fraction of far - near.
 REACH = 0.25
-#: Channels of the place of a Gaussian: position between near and far (0 to 1), and far - near.
+#: Channels of a Gaussian's position: between near and far (0 to 1), and far - near.
 _PLACE = 2
 
 
 class Rays(NamedTuple):
-    """Indices of the Gaussians' pixels among all images', and displacements per metre of depth."""
+    """Flat indices of the Gaussians' pixels, and displacements of their rays per metre of depth."""
 
     place: Int[Tensor, " N"]
     direction: Float[Tensor, "N 3"]
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Rays":
-        """The rays of the pixels that the Gaussians belong to."""
+        """Rays of the Gaussians' pixels."""
         place = raw.image * batch.masks[0, 0].numel() + raw.pixel
         with exact(raw.pixel.device.type):
             return cls(place, ray_directions(batch.cameras).flatten(0, 3)[place])
@@ -56,8 +55,8 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True)
 class State:
-    """Input and output of a round; the first state is what the stages predict, whose Gaussians are
-    not activated yet."""
+    """Input and output of a round; the first state is the prediction of the stages, before Gaussians are
+    activated."""
 
     raw: RawGaussians
     gaussians: Gaussians | None
@@ -65,18 +64,18 @@ class State:
     depth_maps: DepthMaps
 
     def activated(self, activate: "Activate", batch: Batch) -> "State":
-        """The state with the Gaussians of its raw attributes."""
+        """Compute the Gaussians of the raw attributes."""
         gaussians = activate(self.raw, batch, self.points, self.depth_maps)
         return dataclasses.replace(self, gaussians=gaussians)
 
 
 def prediction_of(states: Sequence[State], keeps_drafts: bool, tokens: Tokens) -> Prediction:
-    """The prediction of the last state.
+    """Build the prediction of the last state.
 
     Args:
-        states: before the first round and after each.
+        states: states before the first round and after each.
         keeps_drafts: include the Gaussians before each round.
-        tokens: of the encoder.
+        tokens: tokens of the encoder.
     """
     last = states[-1]
     maps = tuple(state.depth_maps for state in states)
@@ -95,50 +94,48 @@ Number = Annotated[int, Field(ge=1, le=32)]
 
 
 class RoundsOptions(Options):
-    """Rounds that render the input views, compare renders with images and correct the
-    Gaussians."""
+    """Rounds that render the input views, compare renders with images and correct the Gaussians."""
 
     group = "rounds"
     count: Number = 2
-    """Number of rounds; in prediction any up to 32, where halving has left nothing to change."""
+    """Number of rounds in prediction, up to 32; steps halve with each round."""
     training_counts: Annotated[tuple[Number, ...], Field(min_length=1)] = (1, 2, 3)
-    """Numbers of rounds, of which each training step samples one, so that any number works."""
+    """Numbers of rounds from which each training step samples one, so that any number works."""
     hidden: Width = 48
     """Width of the network."""
     depths: int = Field(8, ge=1, le=4096)
-    """Number of depths around the current one at which a round compares the images; 4096 are
-    finer than their pixels."""
+    """Number of depths around the current one at which a round compares the images; 4096 is finer than
+    their pixels."""
     gains: bool = True
-    """Photographs of cameras whose exposure differs are made alike first,
-    where a rig does not know them."""
+    """Estimate and remove differences of exposure between cameras first, unless the rig's gains are
+    given."""
     exchange: Width | None = 16
-    """Feature channels that Gaussians of neighbouring pixels exchange;
-    null: no exchange."""
+    """Feature channels that Gaussians of neighbouring pixels exchange; null: no exchange."""
 
     slopes: bool = False
     """Whether the gradient of the inputs' error with respect to each Gaussian is an input of a round."""
     height: Literal["auto"] | Annotated[int, Field(ge=14, le=16384)] | None = "auto"
-    """Pixels of the subject's height, or of its width if larger, that the weights know; auto: four
-    fifths of the largest side of the photographs of the training. In larger photographs of taller
-    subjects, stages run on smaller copies, whose depths and tokens start the rounds at full size
+    """Height of the subject in training, or its width if larger, in pixels; auto: four fifths of the
+    largest image side in training. Larger images of taller subjects are downsampled for the stages, and
+    the resulting depths and tokens initialise the rounds at full size
     (:mod:`ghgs_lit.method.rounds.coarse`); null: never."""
 
     def build(self, channels: int) -> "Rounds":
-        """The rounds after a Gaussian head with descriptors of width ``channels``."""
+        """Build the rounds after a Gaussian head with descriptors of width ``channels``."""
         return Rounds(self, channels)
 
 
 class NoRounds(nn.Module):
-    """The stage of a model without rounds: the Gaussians of the Gaussian head are the prediction's."""
+    """Stage of a model without rounds, which predicts the Gaussians of the Gaussian head."""
 
     height = None
 
     def forward(self, state: State, activate: Activate, batch: Batch, step: float = 1.0) -> tuple[State, ...]:
-        """The only state, with its Gaussians; arguments as of :meth:`Rounds.forward`."""
+        """The only state, with its Gaussians; arguments as for :meth:`Rounds.forward`."""
         return (state.activated(activate, batch),)
 
     def drawn(self, count: int | None = None) -> AbstractContextManager[None]:
-        """No number of rounds is sampled."""
+        """Context of a training step; nothing is sampled."""
         return nullcontext()
 
 
@@ -149,14 +146,14 @@ def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
 
 
 class Rounds(nn.Module):
-    """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
+    """Corrects Gaussians in several rounds with shared weights; initially changes nothing.
 
-    Each round can change half as much as the one before, depths stay between near and far,
+    Each round can change half as much as the one before, depths stay between near and far, and
     attributes within the bounds of their activations: more rounds than in training do not diverge.
-    The attribute ``count``, the number of rounds outside of training, may be changed at any time.
+    The attribute ``count``, the number of rounds in evaluation, may be changed at any time.
 
     Args:
-        options: of the rounds.
+        options: options of the rounds.
         channels: width of the Gaussian head's descriptors.
     """
 
@@ -179,8 +176,8 @@ class Rounds(nn.Module):
 
     @property
     def height(self) -> int | None:
-        """Pixels of the subject's height that the weights know;
-        None: any, or it is not known from the training."""
+        """Height of the subject in training in pixels; None: images are never downsampled, or the height
+        is unknown."""
         known = self.options.height
         return None if known == "auto" else known
 
@@ -191,19 +188,16 @@ class Rounds(nn.Module):
         batch: Batch,
         step: float | Float[Tensor, " B"] = 1.0,
     ) -> tuple[State, ...]:
-        """The states before the first round and after each.
+        """Run the rounds; returns the states before the first round and after each.
 
         Args:
-            state: the prediction of the stages, with bounds of depths.
-            activate: gives Gaussians from their raw attributes.
+            state: prediction of the stages, with bounds of depths.
+            activate: converts raw attributes to Gaussians.
             batch: images, masks and cameras are read.
-            step: size of the first step in depth, in those after a depth head; one for all elements
-                or for each. Attributes take whole steps.
-
-        Returns:
-            As many states as there are rounds, and one more.
+            step: factor of the first step in depth, for all elements or for each; 1 after a depth head.
+                Attributes always take full steps.
         """
-        # Gaussians that the next round replaces: the loss needs no gradient of them.
+        # The next round replaces these Gaussians: the loss needs no gradient of them.
         draft = torch.no_grad()(activate) if self.training else activate
         if state.gaussians is None:
             state = state.activated(draft, batch)
@@ -226,7 +220,7 @@ class Rounds(nn.Module):
 
     @contextmanager
     def drawn(self, count: int | None = None) -> Iterator[None]:
-        """Fixes the number of rounds of a training step within the context.
+        """Context that fixes the number of rounds of a training step.
 
         Args:
             count: the number; None: the one already fixed, else a sampled one.
@@ -239,7 +233,7 @@ class Rounds(nn.Module):
             self._known_count = before
 
     def _drawn(self) -> int:
-        """The number of rounds of a training step."""
+        """Sample the number of rounds of a training step."""
         counts = self.options.training_counts
         return counts[int(torch.randint(len(counts), ()))]
 
@@ -253,21 +247,20 @@ class Rounds(nn.Module):
         share: float,
         size: float | Float[Tensor, " N"],
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Changes of depths and attributes in a round.
+        """Compute the changes of one round.
 
         Args:
-            state: before the round.
+            state: state before the round.
             batch: images, masks and cameras are read.
-            rays: of the Gaussians' pixels.
-            memory: of the rounds before.
-            windows: places of the Gaussians in maps; None: nothing is exchanged.
-            share: of the largest change of attributes.
-            size: of the step in depth, as a share of the largest one;
-                one for all Gaussians or one for each.
+            rays: rays of the Gaussians' pixels.
+            memory: features of the previous rounds.
+            windows: positions of the Gaussians in maps; None: no exchange.
+            share: factor of the changes of attributes.
+            size: factor of the largest step in depth, for all Gaussians or for each.
 
         Returns:
-            Changes of depths in metres [N] and of raw attributes [N, c],
-            and the memory for the next round.
+            Changes of depths in metres [N] and of raw attributes [N, c], and the memory for the next
+            round.
         """
         gaussians = state.gaussians.detach()
         drawn = None
@@ -296,15 +289,15 @@ class Rounds(nn.Module):
         """Photo-consistency of depths around the current ones, within their bounds.
 
         Args:
-            state: before the round.
+            state: state before the round.
             batch: images, masks and cameras are read.
-            rays: of the Gaussians' pixels.
-            reach: largest distance, as a share of the way from near to far; one, or [N].
+            rays: rays of the Gaussians' pixels.
+            reach: largest distance as a fraction of far - near, for all Gaussians or for each.
 
         Returns:
-            Photo-consistency [N, s] at depths from ``down`` metres in front of each Gaussian to ``up`` metres
-            behind it; position between near and far (0 to 1) and far - near in
-            metres [N, 2]; down [N]; up [N].
+            Photo-consistency [N, s] at depths from ``down`` metres in front of each Gaussian to ``up``
+            metres behind it; position between near and far (0 to 1) and far - near in metres [N, 2];
+            ``down`` [N]; ``up`` [N].
         """
         maps = state.depth_maps
         depth, near, far = (
@@ -314,7 +307,7 @@ class Rounds(nn.Module):
         thickness = far - near
         half = reach * thickness
         share = (depth - near) / torch.where(thickness > 0, thickness, 1)
-        # By rounding a depth may lie slightly outside its bounds.
+        # Through rounding, a depth may lie slightly outside its bounds.
         low = torch.minimum(torch.maximum(depth - half, near), depth)
         high = torch.minimum(depth + half, far)
         high = torch.maximum(high, depth)
@@ -324,13 +317,7 @@ class Rounds(nn.Module):
 
 @torch.no_grad()
 def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
-    """Sizes [N, 1] of a pixel at the Gaussians' depths, in the unit of depth.
-
-    Args:
-        state: depths and images of the Gaussians.
-        batch: cameras are read.
-        rays: of the Gaussians' pixels.
-    """
+    """Size [N, 1] of a pixel at each Gaussian's depth, in the unit of depth."""
     focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()
     depth = at_least_float32(state.depth_maps.depth).flatten()[rays.place]
     return (depth / focal[state.raw.image])[:, None]
@@ -344,16 +331,8 @@ def _moved(
     moved: Float[Tensor, " N"],
     change: Float[Tensor, "N c"],
 ) -> State:
-    """The state after a round.
-
-    Args:
-        state: before it.
-        activate: gives Gaussians from their raw attributes.
-        batch: images, mattes and cameras are read.
-        rays: of the Gaussians' pixels, along which they move.
-        moved: changes of depths in metres.
-        change: of raw attributes.
-    """
+    """Apply the changes of a round: depths by ``moved`` metres along the rays, raw attributes by
+    ``change``."""
     raw = state.raw.changed(change)
     maps = state.depth_maps
     pixels = state.points.pixels
