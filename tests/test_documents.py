@@ -132,7 +132,7 @@ def test_example_of_a_head_is_the_file():
 
 
 def test_packages_exist():
-    """The tables of CONTRIBUTING must name folders and files of today's package."""
+    """The tables in CONTRIBUTING name existing folders and files of the package."""
     cells = re.findall(r"^\|(.+)\|$", (REPOSITORY / "CONTRIBUTING.md").read_text(), re.M)
     named = {n for cell in cells for n in re.findall(r"`([\w/]+\.(?:py|yaml)|[\w/]+/)`", cell)}
     named |= {n for cell in cells for n in re.findall(r"`(\w+)`", cell.split("|")[0])}
