@@ -1,4 +1,4 @@
-"""CUDA graphs: how work is captured, and what cannot be."""
+"""CUDA-graph capture, and detection of operators that cannot be captured."""
 
 import threading
 import traceback
@@ -17,12 +17,12 @@ Result = TypeVar("Result")
 
 
 class CaptureBackend(Protocol):
-    """Captures calls on devices of one type, ``device``."""
+    """Captures calls on devices of type ``device``."""
 
     device: str
 
     def capture(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """The result of a call, and a function that fills it again from the same inputs."""
+        """Capture a call; returns its result and a function that recomputes it in place."""
 
 
 #: A process captures one graph at a time.
@@ -31,18 +31,14 @@ _alone = threading.RLock()
 
 @cache
 def _side_stream(device: int) -> Any:
-    """The stream on which all is captured on a GPU. Graphs share the memory of a pool, and
-    the workspaces of products, on one stream alone.
+    """The stream for all captures on a GPU, which must be the current one.
 
-    Args:
-        device: its number; it is the current one.
-    """
+    Graphs share the memory of a pool, and the workspaces of matrix products, only on one stream."""
     return torch.cuda.Stream(device)
 
 
 class CudaGraphs:
-    """CUDA graphs. One pool of memory for all,
-    since none is replayed while another's results are needed."""
+    """CUDA graphs with a common memory pool, since none is replayed while another's results are in use."""
 
     def __init__(self, device: str = "cuda") -> None:
         self.device = device
@@ -50,11 +46,11 @@ class CudaGraphs:
         self._graphs: WeakSet = WeakSet()
 
     def capture(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """See :class:`CaptureBackend`. The call is made once before on the stream that captures,
-        for workspaces.
+        """See :class:`CaptureBackend`. The call is first made once on the capture stream, to allocate
+        workspaces.
 
         Args:
-            call: starts work of the current GPU alone.
+            call: launches work on the current GPU only.
         """
         with _alone:
             before = torch.cuda.current_stream()
@@ -65,13 +61,12 @@ class CudaGraphs:
                     call()
             finally:
                 before.wait_stream(stream)
-            if not self._graphs:  # PyTorch refuses a pool that no graph needs any more
+            if not self._graphs:  # PyTorch rejects a pool whose graphs are all gone
                 self._pool = torch.cuda.graph_pool_handle()
             graph = torch.cuda.CUDAGraph()
             options = {"pool": self._pool, "stream": stream}
             try:
-                # Other threads may work meanwhile: that which pins memory of the next batch,
-                # that of the gradients.
+                # Other threads may use CUDA meanwhile: to pin memory of the next batch, or in autograd.
                 with torch.cuda.graph(graph, **options, capture_error_mode="thread_local"):
                     result = call()
             except BaseException:
@@ -81,36 +76,31 @@ class CudaGraphs:
         return result, graph.replay
 
     def _end(self, before: Any) -> None:
-        """Undo what PyTorch leaves where a capture fails: its stream is the current one, and the
-        allocator believes that it goes on.
-
-        Args:
-            before: the stream that was current.
-        """
-        with suppress(Exception):  # it has ended, or another version of PyTorch
+        """Clean up after a failed capture: PyTorch leaves its stream current, and its allocator in capture
+        mode; ``before`` is the previous stream."""
+        with suppress(Exception):  # already ended, or another version of PyTorch
             torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), self._pool)
         torch.cuda.set_stream(before)
         self._graphs = WeakSet()
 
 
 _PACKAGE = Path(__file__).parents[1]
-#: Files whose lines do not explain a failure.
+#: Files whose lines are skipped when a failure is located.
 _OWN = ("graphs.py", Path(__file__).name)
 
 
 class NotCapturable(RuntimeError):
-    """What cannot be captured: an operator, or a model with hooks or replaced methods, which a graph
-    would not call. The message names the reason and the place."""
+    """An operator cannot be captured, or a model has hooks or replaced methods, which a graph would not
+    call. The message gives the reason and the location."""
 
 
 class CaptureChecks(TorchDispatchMode):
-    """Rejects what a graph cannot repeat, before it is done.
+    """Rejects operators that a graph cannot replay, before they run.
 
-    That is: reading a value of the device, and copying from the host, whose memory will hold
-    something else.
+    These read a value of the device, or copy from host memory, whose content will have changed.
 
     Attributes:
-        kept: memory that was not made inside, by its address.
+        kept: storages in use that were allocated outside, by address.
     """
 
     def __init__(self) -> None:
@@ -119,13 +109,7 @@ class CaptureChecks(TorchDispatchMode):
         self._made: set[int] = set()
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        """Call an operator of PyTorch if it can be replayed.
-
-        Args:
-            function: the operator.
-            types: PyTorch's: classes of the tensors.
-            args: its positional arguments.
-            kwargs: its named arguments.
+        """Call an operator if it can be replayed.
 
         Raises:
             NotCapturable: it cannot.
@@ -155,14 +139,7 @@ _INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_unsaf
 
 
 def _reason(function: Any, given: list[Tensor], args: tuple, kwargs: dict) -> str | None:
-    """Why an operator cannot be replayed; None if it can.
-
-    Args:
-        function: the operator.
-        given: tensors among its arguments.
-        args: its positional arguments.
-        kwargs: its named arguments.
-    """
+    """Reason why an operator cannot be replayed, None if it can; ``given`` are its tensor arguments."""
     name = function.name().split(".")[0]
     if torch.Tag.data_dependent_output in function.tags:
         return "a value is read"
@@ -179,13 +156,13 @@ def _reason(function: Any, given: list[Tensor], args: tuple, kwargs: dict) -> st
         if target == "cpu" and len(types) > 1:
             return "a value is read"
     copies = len(types) > 1 and (name == "aten::_to_copy" or "copy_" in name)
-    # What remains to be seen of torch.tensor(list, device=...).
+    # The only visible operator of torch.tensor(list, device=...).
     copies |= name == "aten::lift_fresh" and types != {"cpu"}
     return "the host's memory is copied" if copies else None
 
 
 def _line() -> str:
-    """The innermost line of the package that is running."""
+    """Innermost line of this package on the stack, for messages."""
     lines = [f for f in traceback.extract_stack() if Path(f.filename).is_relative_to(_PACKAGE)]
     lines = [f for f in lines if Path(f.filename).name not in _OWN]
     return f"{Path(lines[-1].filename).name}:{lines[-1].lineno}" if lines else "no line of the package"

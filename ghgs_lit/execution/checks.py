@@ -1,5 +1,7 @@
-"""Checks of a batch. Shapes and dtypes are checked at once; checks of values are *findings*, which are
-read from a device together with all else that a plan needs of it."""
+"""Checks of a batch.
+
+Shapes and dtypes are checked at once; checks of values are *findings*, tensors that are read from the
+device together with the plan's statistics."""
 
 from collections.abc import Sequence
 
@@ -13,21 +15,18 @@ from ghgs_lit.types import Batch
 #: Colours may leave [0, 1] by this much, as resizing does.
 _ROUNDING = 1e-3
 
-#: A field, what was expected of it, and which elements [B] or views [B, V] violate it.
+#: A field, the expectation, and the elements [B] or views [B, V] that violate it.
 Finding = tuple[str, str, Tensor]
 
 
 def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Finding]:
-    """Expectations of a batch's values, and where they are violated, without a device-to-host
-    synchronisation.
+    """Check a batch without a device-to-host synchronisation; returns a finding per check, violated or
+    not.
 
     Args:
         batch: its targets are not checked.
         patch_size: must divide height and width, in pixels.
-        values: check every value, too: one NaN in the background leaves no Gaussian.
-
-    Returns:
-        A finding for each check, violated or not.
+        values: also check every value: one NaN in the background would leave no Gaussian.
 
     Raises:
         InputError: a shape or a dtype is wrong.
@@ -37,18 +36,16 @@ def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Find
 
 
 def any_bad(findings: Sequence[Finding]) -> Bool[Tensor, ""]:
-    """Whether anything is violated."""
+    """Whether any expectation is violated."""
     return torch.stack([bad.any() for _, _, bad in findings]).any()
 
 
 def refuse(findings: Sequence[Finding]) -> None:
-    """Rejects a batch at the first field whose values violate an expectation.
-
-    Args:
-        findings: of the batch, which are read with a device-to-host synchronisation.
+    """Raise an error for the first violated expectation; reads findings with a device-to-host
+    synchronisation.
 
     Raises:
-        InputError: with the field, the expectation, and the violating elements or views.
+        InputError: the message names the field, the expectation, and the violating elements or views.
     """
     for name, expected, bad in findings:
         found = f"others at {bad.nonzero().tolist()} (element, view)"
@@ -56,7 +53,7 @@ def refuse(findings: Sequence[Finding]) -> None:
 
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
-    """Raises InputError for a shape or a dtype that the stages do not support."""
+    """Raise InputError for shapes and dtypes that the stages do not support."""
     images = batch.images
     colored = images.dim() == 5 and images.shape[2] == 3
     require(colored, "batch.images", "[B, V, 3, H, W]", tuple(images.shape))
@@ -86,7 +83,7 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
 
 
 def _findings_of_cameras(batch: Batch) -> list[Finding]:
-    """Checks of cameras and masks, which are always made."""
+    """Checks of cameras and masks, which are never skipped."""
     findings = []
     for name in ("intrinsics", "extrinsics"):
         matrices = getattr(batch.cameras, name)
@@ -113,10 +110,9 @@ def _findings_of_values(batch: Batch) -> list[Finding]:
 
 
 def _beyond(values: Tensor, highest: float) -> Tensor:
-    """Views of ``values`` [B, V, ...] with a NaN or a value outside 0 to ``highest``,
-    up to rounding."""
+    """Views of ``values`` [B, V, ...] with NaN or a value outside [0, ``highest``], up to rounding."""
     values = values.flatten(2)
-    if values.device.type == "cpu":  # where aminmax takes twenty times as long
+    if values.device.type == "cpu":  # aminmax takes twenty times as long there
         low, high = values.amin(-1), values.amax(-1)
     else:
         low, high = values.aminmax(dim=-1)

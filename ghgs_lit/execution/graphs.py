@@ -1,11 +1,10 @@
-"""Functions of tensors that are captured once for each shape bucket and then replayed as one CUDA
-graph.
+"""Functions of tensors that are captured once per shape bucket, and replayed as a CUDA graph.
 
 A host that launches thousands of small kernels is slower than the GPU that runs them. A graph
-launches all of them at once. It repeats the very same work: the same sizes, the same addresses, the
-same numbers of the host. So a call is captured together with all that may differ between calls
-(:func:`described`), its inputs are copied to the places that were captured, and functions that read
-a value of the device are rejected."""
+launches all of them at once, but repeats exactly the same work: the same sizes, addresses and host
+constants. So a graph is stored under a key of everything that may differ between calls
+(:func:`described`), inputs are copied to the captured addresses, and functions that read a value of
+the device are rejected."""
 
 import threading
 import warnings
@@ -28,14 +27,13 @@ Result = TypeVar("Result")
 
 @dataclass
 class _Graph:
-    """What was captured for one shape bucket.
+    """Captured graph of one shape bucket.
 
     Attributes:
-        inputs: where the tensors of inputs are copied to.
-        result: where the result comes about.
-        replay: does the work again.
-        kept: memory that is read and that was there before, such as tables in caches,
-            which may forget them.
+        inputs: tensors that inputs are copied to.
+        result: result that a replay overwrites.
+        replay: launches the graph.
+        kept: previously allocated memory that the graph reads, such as cached tables, to keep it alive.
     """
 
     inputs: list[Tensor]
@@ -49,23 +47,23 @@ _caches: WeakSet = WeakSet()
 
 
 class GraphCache:
-    """Calls functions of tensors, and replays them as CUDA graphs from the second call of a shape
-    bucket on.
+    """Calls functions of tensors, and replays them as CUDA graphs after the first calls of a shape bucket.
 
-    Graphs keep memory. Where a call finds too little of it, all graphs of the process are freed, the
-    call is repeated, and graphs are captured anew later on.
+    Graphs hold memory. If a call runs out of memory, all graphs of the process are freed, the call is
+    repeated, and graphs are captured again later.
 
     Args:
-        limit: largest number of graphs, at least 1; the least recently used one makes room.
-        eager: calls of a bucket before it is captured: what comes once is not worth it, and
-            caches are filled.
+        limit: largest number of graphs, at least 1; the least recently used one is evicted.
+        eager: number of eager calls of a bucket before it is captured: they fill caches, and a bucket
+            that occurs once is not worth a capture.
         backend: captures graphs; None: CUDA graphs.
-        recent: number of buckets whose eager calls are remembered; None: 64 for each graph. A
-            bucket that returns only after more than there are graphs would be captured in vain.
+        recent: number of buckets whose eager calls are remembered; None: 64 per graph. A bucket that
+            recurs only after more buckets than there are graphs would be captured in vain.
 
     Attributes:
-        counts: calls that were ``replayed``, ``captured`` (and replayed), ``eager``, ``refused``.
-        reasons: why calls were not captured, each once.
+        counts: numbers of calls that were ``replayed``, ``captured`` (and replayed), ``eager``,
+            ``refused``.
+        reasons: reasons why calls were not captured, each once.
     """
 
     def __init__(
@@ -83,7 +81,7 @@ class GraphCache:
         _caches.add(self)
 
     def __reduce__(self) -> tuple:
-        """Copies capture anew."""
+        """Copies start without graphs."""
         return type(self), (self.limit, self.eager, type(self.backend)(self.backend.device), self.recent)
 
     def clear(self) -> None:
@@ -93,30 +91,21 @@ class GraphCache:
         self._refused: set[Hashable] = set()
 
     def of_weights(self, state: ModelState) -> ModelState:
-        """Free all graphs if they read other weights than those of a state.
-
-        Args:
-            state: of the model that is captured.
-        """
+        """Free all graphs if they read weights other than those of ``state``, and return it."""
         if state.weights != self._weights:
             self.clear()
             self._weights = state.weights
         return state
 
     def note(self, reason: str) -> None:
-        """Log once why a call is not captured."""
+        """Warn once per reason why a call is not captured."""
         if reason not in self.reasons:
             self.reasons.append(reason)
             warnings.warn(f"not captured as a CUDA graph, but called eagerly: {reason}", stacklevel=3)
 
     def settled(self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()) -> Result:
-        """:meth:`__call__` of a function that renders, repeated until renderings have room enough.
-
-        Args:
-            function: as of :meth:`__call__`.
-            inputs: as of :meth:`__call__`.
-            key: as of :meth:`__call__`.
-        """
+        """:meth:`__call__` of a function that renders, repeated until renderings have enough capacity;
+        arguments as for :meth:`__call__`."""
 
         def rendered(inputs: Any) -> tuple[Result, Rooms]:
             with deferred() as rooms:
@@ -126,7 +115,7 @@ class GraphCache:
             result, rooms = self(rendered, inputs, key)
             if rooms.suffice():
                 return result
-            # A replay would have as little room.
+            # A replay would have the same capacity.
             self._graphs.pop(self._bucket(inputs, key, []), None)
 
     def __call__(
@@ -136,20 +125,20 @@ class GraphCache:
         key: Hashable = (),
         written: Sequence[Tensor] = (),
     ) -> Result:
-        """``function(inputs)``, without a gradient.
+        """Return ``function(inputs)``, without a gradient.
 
         Args:
-            function: depends on ``inputs``, ``key`` and on tensors that stay where they are, and
-                writes none of its inputs. The first call of a bucket is eager, and so are all where
-                the capture fails, which is logged once.
+            function: depends on ``inputs``, ``key`` and tensors with fixed addresses, and does not write
+                its inputs. The first calls of a bucket are eager, and so are all calls if the capture
+                fails, which is logged once.
             inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
                 hashable.
-            key: all else that may change what ``function`` does.
-            written: memory that ``function`` writes to and that was there before. The capture calls
-                it without effect.
+            key: everything else that may change what ``function`` does.
+            written: previously allocated memory that ``function`` writes to; a capture leaves it
+                unchanged.
 
         Returns:
-            Its result, in memory that later calls do not write to.
+            The result, in memory that later calls do not overwrite.
         """
         tensors: list[Tensor] = []
         bucket = self._bucket(inputs, key, tensors)
@@ -172,7 +161,7 @@ class GraphCache:
         return self._called(function, inputs, written)
 
     def _is_due(self, bucket: Hashable) -> bool:
-        """Whether a bucket had its eager calls; this one is counted."""
+        """Count a call of a bucket, and return whether it had its eager calls before."""
         if bucket in self._refused:
             return False
         before = self._seen.pop(bucket, 0)
@@ -189,7 +178,7 @@ class GraphCache:
         tensors: list[Tensor],
         written: Sequence[Tensor],
     ) -> "_Graph | None":
-        """A new graph; None where it cannot be captured. Arguments as of :meth:`__call__`."""
+        """Capture a new graph; None if that fails. Arguments as for :meth:`__call__`."""
         graph = None
         is_full = False
         try:
@@ -198,9 +187,9 @@ class GraphCache:
                 graph = _captured(self.backend, function, inputs, written)
         except torch.OutOfMemoryError:
             is_full = True
-        except Exception as error:  # a driver has many ways to fail
+        except Exception as error:  # drivers fail in many ways
             self._refuse(bucket, " ".join(str(error).split())[:300] or type(error).__name__)
-        # Not where the error is known, which keeps all memory of the capture.
+        # Outside the handler, whose traceback keeps all memory of the capture alive.
         if is_full and not free_graphs():
             self._refuse(bucket, "too little memory for a graph")
         if graph is None:
@@ -212,31 +201,21 @@ class GraphCache:
         return graph
 
     def _refuse(self, bucket: Hashable, reason: str) -> None:
-        """Capture a bucket no more, until graphs are freed."""
+        """Do not capture a bucket again until graphs are freed."""
         self.counts["refused"] += 1
         self._refused.add(bucket)
         self.note(reason)
 
     def _called(self, function: Callable[[Any], Result], inputs: Any, written: Sequence[Tensor]) -> Result:
-        """``function(inputs)``, once more where graphs left too little memory for it.
-
-        Args:
-            function: as of :meth:`__call__`.
-            inputs: as of :meth:`__call__`.
-            written: as of :meth:`__call__`; with some of it a call cannot be repeated.
-        """
+        """``function(inputs)``, repeated without graphs if memory runs out; not with ``written`` memory,
+        since such a call cannot be repeated."""
         if written:
             return function(inputs)
         return with_memory(lambda: function(inputs))
 
     def _bucket(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
-        """What must be equal for a graph to be valid; None: it is not hashable.
-
-        Args:
-            inputs: as of :meth:`__call__`.
-            key: as of :meth:`__call__`.
-            tensors: gets the tensors of the inputs, in their order.
-        """
+        """Key of the graphs that are valid for a call; None if it is not hashable. Appends the tensors of
+        ``inputs`` to ``tensors``."""
         bucket = (key, described(inputs, tensors), _surroundings(self.backend.device))
         try:
             hash(bucket)
@@ -255,7 +234,7 @@ def free_graphs() -> bool:
 
 
 def with_memory(call: Callable[[], Result]) -> Result:
-    """The result of a call, once more without graphs where they left too little memory for it."""
+    """Return ``call()``, repeated without graphs if memory runs out."""
     try:
         return call()
     except torch.OutOfMemoryError:
@@ -265,13 +244,13 @@ def with_memory(call: Callable[[], Result]) -> Result:
 
 
 def described(value: Any, tensors: list[Tensor]) -> Any:
-    """What is fixed in ``value``: sizes and types of its tensors, and all that is no tensor.
+    """Describe what a graph requires of ``value``: sizes and types of its tensors, and all other values.
 
-    Values that dataclasses keep beside their fields belong to them.
+    Cached values of dataclasses, which are not fields, are included.
 
     Args:
         value: dataclasses, tuples, lists and dicts of tensors and of anything else.
-        tensors: gets the tensors of the value, in their order.
+        tensors: list to which the tensors of the value are appended, in order.
     """
     if isinstance(value, Tensor):
         tensors.append(value)
@@ -286,7 +265,7 @@ def described(value: Any, tensors: list[Tensor]) -> Any:
 
 
 def _entries(value: Any) -> Iterator[tuple[str, Any]]:
-    """Fields of a dataclass, then what it keeps beside them."""
+    """Fields of a dataclass, then its other attributes."""
     names = [field.name for field in fields(value)]
     yield from ((name, getattr(value, name)) for name in names)
     yield from ((name, item) for name, item in vars(value).items() if name not in names)
@@ -300,7 +279,7 @@ def _surroundings(device: str) -> Hashable:
 
 
 def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
-    """``value`` with other tensors, also in what dataclasses keep beside their fields."""
+    """Replace all tensors of ``value``, also in attributes of dataclasses that are not fields."""
     if is_dataclass(value) and not isinstance(value, type):
         names = {field.name for field in fields(value)}
         entries = {name: _replaced(item, replace) for name, item in _entries(value)}
@@ -318,13 +297,7 @@ def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
 def _captured(
     backend: CaptureBackend, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]
 ) -> _Graph:
-    """Capture ``function(inputs)``.
-
-    Args:
-        backend: captures graphs.
-        function: as of :meth:`GraphCache.__call__`.
-        inputs: as of :meth:`GraphCache.__call__`; they are copied.
-        written: as of :meth:`GraphCache.__call__`; as before in the end.
+    """Capture ``function(inputs)`` on copies of the inputs, and restore ``written`` afterwards.
 
     Raises:
         NotCapturable: the function reads a value of the device or copies from the host.
@@ -339,10 +312,10 @@ def _captured(
     checks: list[CaptureChecks] = []
 
     def checked() -> Any:
-        # Casts of weights would be shared between what is captured and what is not.
+        # Cached casts of weights would be shared between captured and eager work.
         torch.clear_autocast_cache()
         checks.append(CaptureChecks())
-        # What the first call computes and keeps beside fields must be computed by the graph.
+        # A fresh copy: values that the first call caches in dataclasses must be computed by the graph.
         fresh = _replaced(fixed, lambda tensor: tensor)
         with checks[-1]:
             return function(fresh)
@@ -351,19 +324,15 @@ def _captured(
     try:
         result, replay = backend.capture(checked)
     finally:
-        torch.clear_autocast_cache()  # of a capture that failed, casts are no numbers
+        torch.clear_autocast_cache()  # casts from a failed capture were never computed
         with torch.no_grad():
             _copy_all(written, values)
     return _Graph(places, result, replay, list(checks[-1].kept.values()))
 
 
 def _replayed(graph: _Graph, tensors: list[Tensor]) -> Any:
-    """The result for other values, in memory of its own.
-
-    Args:
-        graph: of the bucket of the inputs.
-        tensors: of the inputs, in the order of :func:`described`.
-    """
+    """Replay a graph with other input tensors (in the order of :func:`described`); returns a copy of the
+    result."""
     _copy_all(graph.inputs, tensors)
     graph.replay()
     results: dict[int, Tensor] = {}
@@ -379,16 +348,10 @@ def _replayed(graph: _Graph, tensors: list[Tensor]) -> Any:
 
 
 def _copy_all(places: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
-    """Copy tensors to others of their sizes, with a launch for each type.
-
-    Args:
-        places: written.
-        sources: of the same types.
-    """
+    """Copy ``sources`` to ``places`` of the same sizes, with one launch per dtype."""
     groups: dict[tuple, tuple[list[Tensor], list[Tensor]]] = {}
     for place, source in zip(places, sources, strict=True):
-        # One pair of another type, or that lies in memory otherwise,
-        # makes PyTorch copy all one by one.
+        # A single pair with another dtype or layout would make PyTorch copy all pairs one by one.
         kind = (source.dtype, source.device, place.stride() == source.stride())
         group = groups.setdefault(kind, ([], []))
         group[0].append(place)

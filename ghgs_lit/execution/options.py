@@ -8,28 +8,25 @@ from ghgs_lit.config.options import Options, Text
 
 
 class ModelOptions(Options):
-    """Preparation of input views before the stages, and of predictions after them."""
+    """Pre- and postprocessing around the stages."""
 
     group = "model"
     name: Text = "paper"
-    """Name of the combination of stages, for tables."""
+    """Name of the model, for tables."""
     pad: Literal["none", "multiple"] = "none"
-    """multiple: pad images with black up to the next multiple of the patch size, and crop
-    predictions again; none: their sides must be multiples."""
+    """multiple: pad images with black to the next multiple of the patch size, and crop predictions; none:
+    image sides must be multiples."""
     frame: Literal["subject", "world"] = "subject"
-    """subject: the stages work in metres around the subject, whatever the world's unit, origin and
-    axes; world: in coordinates as they are given."""
+    """Coordinates of the stages: subject: metres around the subject, whatever the world's unit, origin and
+    axes; world: as given."""
     matte: float | None = Field(None, ge=0, le=0.5)
-    """Pixels that show a larger share of the subject become Gaussians, and the share is part of
-    their colours and opacities; null: masks decide, mattes are ignored."""
+    """Pixels with a larger matte become Gaussians, and the matte enters their colours and opacities; null:
+    use masks and ignore mattes."""
     capture: Literal["auto", "off"] = "auto"
-    """auto: on CUDA, predictions and training steps of one shape bucket are captured as a CUDA graph
-    and replayed; off: every operator is called each time."""
+    """auto: on CUDA, capture predictions and training steps of each shape bucket as a CUDA graph and replay
+    it; off: launch every operator."""
 
     def side_multiple(self, patch_size: int) -> int:
-        """The number of pixels that must divide height and width of input views; 1 with padding.
-
-        Args:
-            patch_size: of the encoder, in pixels.
-        """
+        """Number of pixels that must divide height and width of input views: the encoder's patch size, or 1
+        with padding."""
         return 1 if self.pad == "multiple" else patch_size

@@ -1,4 +1,4 @@
-"""Predictions of a model for batches of any world and size."""
+"""Prediction for batches in any world frame and of any image size."""
 
 from dataclasses import replace
 from functools import partial
@@ -30,10 +30,10 @@ class Prepared(NamedTuple):
     """A preprocessed batch and its plan.
 
     Attributes:
-        batch: preprocessed.
-        plan: of it.
+        batch: the preprocessed batch.
+        plan: its plan.
         done: its preprocessing.
-        state: of the model whose work is captured; None: operators are called one by one.
+        state: state of the model for CUDA-graph capture; None: run eagerly.
     """
 
     batch: Batch
@@ -43,17 +43,17 @@ class Prepared(NamedTuple):
 
 
 class Predictor:
-    """``predictor(batch) -> Prediction``: checks, the subject's frame, padding, precision, coarse to
-    fine, and CUDA graphs around a model.
+    """``predictor(batch) -> Prediction``: a model with checks, the subject's frame, padding, precision,
+    coarse to fine, and CUDA graphs.
 
     Args:
         model: the stages.
-        options: of pre- and postprocessing; None: those of the configuration that built the model.
-        precision: of products, one of :data:`ghgs_lit.geometry.precision.PRECISIONS`.
+        options: options of pre- and postprocessing; None: those of the model's configuration.
+        precision: precision of products, one of :data:`ghgs_lit.geometry.precision.PRECISIONS`.
         checks_values: reject input views, depths and bodies with NaN or values out of range.
 
     Attributes:
-        graphs: captured predictions, at most two for each shape bucket.
+        graphs: captured graphs, at most two per shape bucket.
 
     Raises:
         InputError: an option or the precision is unknown.
@@ -77,47 +77,46 @@ class Predictor:
     def from_checkpoint(
         cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "Predictor":
-        """The predictor of a checkpoint, in evaluation mode.
+        """Load the predictor of a checkpoint, in evaluation mode.
 
         Args:
-            path: of a checkpoint of this package; by default the weights that come with it.
-            map_location: the device that the model is moved to.
-            dtype: precision of the encoder; None: as in the file, where the device has it.
-                Heads are float32.
+            path: checkpoint of this package; by default the weights that come with it.
+            map_location: device to move the model to.
+            dtype: dtype of the encoder; None: as in the file, if the device supports it. Heads are
+                float32.
 
         Raises:
             FileNotFoundError: there is no such file.
-            InputError: it is not a checkpoint of this package,
-                or its weights are not finite or do not fit.
+            InputError: it is not a checkpoint of this package, or its weights are not finite or do not
+                fit.
         """
         model = GHGS.from_config(read_config(path), empty=True)
         load_weights(model, path, dtype, map_location)
         return cls(model.to(map_location).eval())
 
     def __call__(self, batch: Batch) -> Prediction:
-        """Gaussians, depths and points in the world of the cameras.
+        """Predict Gaussians, depths and points.
 
         Args:
             batch: input views, masks and cameras are read, and mattes and gains if there are any.
 
         Returns:
-            The prediction in the pixels of the input views,
-            in the unit and the axes of the cameras' world.
+            The prediction in the pixels of the input views, in the unit and axes of the cameras' world.
 
         Raises:
-            InputError: the batch does not fit the stages.
+            InputError: the batch is invalid or does not fit the stages.
         """
         return self.finish(self.prepare(batch))
 
     def prepare(self, batch: Batch, least: Sizes | None = None) -> Prepared:
-        """Checks, preprocesses and plans a batch.
+        """Check, preprocess and plan a batch.
 
         Args:
             batch: as for :meth:`__call__`.
-            least: sizes that the plan reuses while they suffice; None: sizes of the scene.
+            least: sizes that the plan reuses if they suffice; None: sizes of the scene.
 
         Raises:
-            InputError: the batch does not fit the stages.
+            InputError: the batch is invalid or does not fit the stages.
         """
         state = self._state(batch)
         inside, done, findings, measured = (
@@ -129,27 +128,27 @@ class Predictor:
         return Prepared(inside, plan, done, state)
 
     def finish(self, prepared: Prepared) -> Prediction:
-        """The prediction for a prepared batch."""
+        """Predict from a prepared batch."""
         with precision_of(self.precision, prepared.batch.masks.device):
             prediction = self._predict(prepared, self._coarse(prepared))
         return prepared.plan.trimmed(prediction)
 
     @property
     def side_multiple(self) -> int:
-        """The number of pixels that must divide height and width of input views."""
+        """Number of pixels that must divide height and width of input views."""
         return self.options.side_multiple(self.model.encoder.patch_size)
 
     def needs_copies(self, batch: Batch) -> bool:
-        """Whether subjects are so tall that smaller copies of their views are predicted, too.
+        """Whether subjects are so tall that downsampled copies of their views are used.
 
         Args:
-            batch: preprocessed, with extents that a plan has read.
+            batch: preprocessed, with extents read by a plan.
         """
         height = self.model.rounds.height
         return height is not None and any(coarse_sizes(batch, height, self.model.encoder.patch_size))
 
     def _state(self, batch: Batch) -> ModelState | None:
-        """The state of the model if its work can be captured; the device is looked at first."""
+        """State of the model if it can be captured, else None."""
         if batch.masks.device.type != self.graphs.backend.device or self.options.capture == "off":
             return None
         try:
@@ -166,22 +165,21 @@ class Predictor:
     def _captured(
         self, batch: Batch, state: ModelState
     ) -> tuple[Batch, Preprocessing, list[Finding], MaskStatistics]:
-        """:meth:`_enter`, captured where no gradient is required."""
+        """:meth:`_enter`, captured unless a gradient is required."""
         tensors: list[torch.Tensor] = []
         described(batch, tensors)
         if any(tensor.requires_grad for tensor in tensors):
             return self._enter(batch)
-        # Without what was computed of the cameras,
-        # or the same batch would be of another bucket the next time.
+        # Fresh cameras: cached values would put the same batch into another bucket the next time.
         bare = replace(batch, cameras=replace(batch.cameras), targets=None, subjects=(), views=())
         key = ("enter", self.options, self.checks_values, state.encoder)
         with torch.no_grad():
             inside, *others = self.graphs(self._enter, bare, key)
-        # Targets and names take no part.
+        # Targets and names are not preprocessed.
         return replace(inside, targets=batch.targets, subjects=batch.subjects, views=batch.views), *others
 
     def _predict(self, prepared: Prepared, coarse: Coarse | None) -> Prediction:
-        """The stages and what is undone after them; renderings have room enough."""
+        """Run the stages and postprocessing, repeated until renderings have enough capacity."""
         batch, plan, done, state = prepared
 
         def predict(
@@ -200,12 +198,7 @@ class Predictor:
         )
 
     def fits(self, batch: Batch, plan: Plan) -> bool:
-        """Whether the stages can be captured for a batch on a device that captures.
-
-        Args:
-            batch: preprocessed.
-            plan: of it.
-        """
+        """Whether the stages can be captured for a preprocessed batch with its plan; logs why not."""
         if type(batch) not in (Batch, PaddedBatch):
             self.graphs.note(f"a batch of the class {type(batch).__name__}")
         elif not plan.is_bucket:
@@ -215,7 +208,7 @@ class Predictor:
         return False
 
     def _coarse(self, prepared: Prepared) -> Coarse | None:
-        """Predictions from downsampled views of subjects taller than in training."""
+        """Predict from downsampled views if subjects are taller than in training."""
         model = self.model
         if model.rounds.height is None:
             return None

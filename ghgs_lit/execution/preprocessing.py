@@ -1,5 +1,5 @@
-"""Preprocessing of a batch (masks from mattes, metres around the subject, a black border up to whole
-patches) and its inverse for predictions."""
+"""Preprocessing of a batch (masks from mattes, the subject's frame, padding to whole patches) and its
+inverse for predictions."""
 
 from dataclasses import dataclass, replace
 
@@ -15,12 +15,12 @@ from ghgs_lit.types import Batch, Prediction
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Preprocessing of a batch, recorded so that it can be inverted in its prediction.
+    """Record of a batch's preprocessing, to invert it in the prediction.
 
     Attributes:
-        dtype: of the cameras that were given.
-        frame: of the subjects; None: the world's.
-        padding: of the input views; None: they had whole patches.
+        dtype: dtype of the original cameras.
+        frame: frame of the subjects; None: the world.
+        padding: padding of the input views; None: no padding.
     """
 
     dtype: torch.dtype
@@ -28,7 +28,7 @@ class Preprocessing:
     padding: Padding | None
 
     def undo(self, prediction: Prediction) -> Prediction:
-        """The prediction in the pixels and the world of the batch that was given, without tokens."""
+        """Convert a prediction to the pixels and the world of the original batch, without tokens."""
         prediction = replace(prediction, tokens=None)
         if self.padding is not None:
             prediction = self.padding.cut_prediction(prediction)
@@ -38,13 +38,13 @@ class Preprocessing:
 def preprocess(
     batch: Batch, options: ModelOptions, patch_size: int, checks_values: bool
 ) -> tuple[Batch, Preprocessing, list[Finding]]:
-    """The preprocessed batch.
+    """Preprocess a batch.
 
     Args:
         batch: in the cameras' world.
-        options: of the preprocessing.
-        patch_size: of the encoder, in pixels.
-        checks_values: check every value, too.
+        options: options of the preprocessing.
+        patch_size: patch size of the encoder in pixels.
+        checks_values: also check every value.
 
     Returns:
         The batch, its preprocessing, and findings about its values, to be read later.
@@ -63,11 +63,7 @@ def preprocess(
 
 
 def without_targets(batch: Batch) -> Batch:
-    """The batch with what the stages read alone, and nothing that was computed from it.
-
-    Args:
-        batch: with or without a border.
-    """
+    """Copy a batch, padded or not, with only the fields that the stages read, and without cached values."""
     bare = replace(
         batch, cameras=replace(batch.cameras), targets=None, body_vertices=None, subjects=(), views=()
     )

@@ -1,7 +1,7 @@
-"""A batch and its plan as inputs of a captured graph: tensors, and numbers of their shape bucket.
+"""A batch and its plan as inputs of a captured graph: tensors, and constants of their shape bucket.
 
-What follows a plan (:mod:`ghgs_lit.method.plan`) depends on sizes alone, and on a GPU these are
-buckets. So the work is the same for every batch of a bucket."""
+Shapes of the work after a plan (:mod:`ghgs_lit.method.plan`) depend on its sizes alone, which on a GPU
+are shape buckets: every batch of a bucket launches the same kernels."""
 
 from dataclasses import dataclass
 
@@ -32,13 +32,13 @@ class Scene:
 
     @classmethod
     def of(cls, batch: Batch, plan: Plan) -> "Scene":
-        """The inputs that the stages read; what only losses read is left out."""
+        """Collect the inputs of the stages; fields that only losses read are left out."""
         kept = None if plan.kept.is_whole else plan.kept.mask
         facts = (plan.patch_size, plan.pixels, plan.tokens, plan.sizes, batch.cameras.has_skew)
         return cls(without_targets(batch), plan.shown, kept, *plan.bucket_extents(), *facts)
 
     def read(self) -> tuple[Batch, Plan]:
-        """A batch and its plan, for which no value of a tensor is needed."""
+        """Rebuild the batch and its plan without reading values of tensors."""
         batch = without_targets(self.batch)
         facts = (self.extents, self.shown_extents, self.patch_size, self.pixels, self.tokens, (), self.sizes)
         device = self.shown.device

@@ -1,4 +1,4 @@
-"""What a captured graph depends on besides its inputs: the weights of a model and its settings."""
+"""State that a captured graph depends on besides its inputs: weights and settings of a model."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class ModelState(NamedTuple):
 
     Attributes:
         weights: identity and address of all parameters and buffers.
-        settings: all else, by the name of the stage.
+        settings: all other attributes, by stage.
     """
 
     weights: tuple
@@ -29,13 +29,13 @@ class ModelState(NamedTuple):
 
     @property
     def encoder(self) -> tuple:
-        """The settings of the encoder."""
+        """Settings of the encoder."""
         return dict(self.settings)["encoder"]
 
 
 @dataclass(frozen=True, eq=False)
 class Same:
-    """Equal to what holds the very same object, which stays alive with it."""
+    """Compares an object by identity, and keeps it alive."""
 
     value: Any
 
@@ -47,13 +47,10 @@ class Same:
 
 
 def state_of(model: nn.Module) -> ModelState:
-    """The state of a model that is to be captured.
-
-    Args:
-        model: with its stages, modules or not.
+    """Get the state of a model to be captured.
 
     Raises:
-        NotCapturable: a call of one of its modules is observed or replaced.
+        NotCapturable: a module has hooks or a replaced method.
     """
     if torch_module._has_any_global_hook():
         raise NotCapturable("hooks of all modules")
@@ -78,12 +75,8 @@ def state_of(model: nn.Module) -> ModelState:
 
 
 def _key(value: Any, is_whole: bool = True) -> Hashable:
-    """Equal for settings that are the same.
-
-    Args:
-        value: of an attribute.
-        is_whole: whether attributes of an object count, too.
-    """
+    """Key of an attribute's value that is equal for equal settings; ``is_whole``: includes attributes of
+    an object."""
     if isinstance(value, _SIMPLE):
         return value
     if isinstance(value, (tuple, list)):

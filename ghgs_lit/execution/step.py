@@ -1,10 +1,10 @@
-"""Training steps whose work is captured on a GPU for each shape bucket, and replayed.
+"""Training steps that are captured on a GPU for each shape bucket, and replayed.
 
-A step of a small model needs thousands of launches, and the host takes longer to make them than the
-GPU to run them. What follows a plan depends on sizes alone, in training as in predictions. So the
-stages, the rendering, the loss and the gradients of all weights are one CUDA graph here. What
-surrounds it is called eagerly: the plan before it; hooks of weights, clipping and the optimizer after
-it, which find a loss with a gradient as usual."""
+A step of a small model needs thousands of launches, which take the host longer than the GPU needs to
+run them. As in predictions, shapes after the plan depend on its sizes alone. So the stages, the
+rendering, the loss and the gradients of all weights are one CUDA graph. The plan before it is made
+eagerly, and so is everything after it: hooks of weights, clipping and the optimizer get a loss with a
+gradient as usual."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -27,10 +27,10 @@ from ghgs_lit.types import Batch
 
 
 class Outcome(NamedTuple):
-    """Of a forward pass.
+    """Result of a training step's forward pass.
 
     Attributes:
-        total: the loss, without dimensions, with a gradient.
+        total: the loss, a scalar with a gradient.
         values: its unweighted terms by name.
         gaussians: number of Gaussians of the batch.
     """
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
 
 
 class _Known(torch.autograd.Function):
-    """A loss whose gradients are known: ``apply(total, gradients, *weights)``."""
+    """Attaches known gradients to a loss: ``apply(total, gradients, *weights)``."""
 
     @staticmethod
     def forward(ctx: Any, total: Tensor, gradients: Sequence[Tensor], *weights: nn.Parameter) -> Tensor:
@@ -56,13 +56,7 @@ class _Known(torch.autograd.Function):
 
 
 class _Pass(nn.Module):
-    """Stages, rendering and loss, whose weights can be replaced by others.
-
-    Args:
-        predictor: has the model of the training.
-        renderer: renders its Gaussians.
-        losses: compares them.
-    """
+    """Stages, rendering and loss as one module, for ``functional_call`` with other weights."""
 
     def __init__(self, predictor: Predictor, renderer: Renderer, losses: Losses):
         super().__init__()
@@ -72,12 +66,12 @@ class _Pass(nn.Module):
         self.losses = losses
 
     def forward(self, scene: Scene, done: Preprocessing, seen: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss and its terms. Gaussians that fill a bucket are rendered, too, with opacity 0.
+        """Compute the loss and its terms; Gaussians that pad a bucket are rendered, too, with opacity 0.
 
         Args:
-            scene: the preprocessed batch, and its plan.
-            done: what was done to it.
-            seen: the batch that was given, with targets.
+            scene: the preprocessed batch and its plan.
+            done: its preprocessing.
+            seen: the original batch, with targets.
         """
         with precision_of(self.predictor.precision, seen.masks.device):
             prediction = done.undo(self.model(*scene.read()))
@@ -86,18 +80,18 @@ class _Pass(nn.Module):
 
 
 class CapturedStep:
-    """``step(batch) -> Outcome``: the forward pass of a training step, captured where it can be.
+    """``step(batch) -> Outcome``: the forward pass of a training step, captured if possible.
 
     Args:
-        predictor: has the model of the training.
-        renderer: of the training; others than this package's may do what depends on values.
+        predictor: contains the model.
+        renderer: renderer of the training; only this package's is captured, since others may depend on
+            values of tensors.
         losses: likewise.
 
     Attributes:
-        graphs: one for each shape bucket.
-        buckets: sizes so far, by the shape of input views and what their encoder sees. Subjects of
-            other batches are of other sizes, and each bucket would have to be captured. So sizes are
-            kept as long as they are enough for the subjects of a batch.
+        graphs: captured graphs, one per shape bucket.
+        buckets: sizes so far, by the shape of input views and the encoder's choice of patches. Sizes are
+            reused as long as the subjects of a batch fit, so that few buckets must be captured.
     """
 
     def __init__(self, predictor: Predictor, renderer: Callable, losses: Callable):
@@ -108,25 +102,16 @@ class CapturedStep:
         self.buckets: dict[tuple, Sizes] = {}
 
     def may_capture(self, device: str) -> bool:
-        """Whether steps of the training are of a kind that is captured.
-
-        Args:
-            device: its type.
-        """
+        """Whether training steps on a type of device can be captured at all."""
         known = isinstance(self.renderer, Renderer) and isinstance(self.losses, Losses)
         known = known and not self.losses.weights.model_extra  # terms of a plug-in may do likewise
         return known and self.predictor.options.capture == "auto" and device == self.graphs.backend.device
 
     def captures(self, batch: Batch, is_scaled: bool = False) -> bool:
-        """Whether a training step is tried to be captured.
+        """Whether to try to capture a training step.
 
-        Args:
-            batch: of the step.
-            is_scaled: whether the loss has a factor.
-
-        Returns:
-            True on a device that captures, with ``model.capture=auto``, where no tokens are read from
-            disk, and a loss with float16 has a factor.
+        Requires a device with capture, ``model.capture=auto``, no tokens read from disk, and under
+        float16 autocast a scaled loss (``is_scaled``).
         """
         device = batch.masks.device.type
         model = self.predictor.model
@@ -138,14 +123,13 @@ class CapturedStep:
         return not reads_disk and (is_scaled or not is_half)  # gradients would underflow
 
     def __call__(self, batch: Batch, scale: Tensor | None = None) -> Outcome:
-        """The forward pass of a training step, replayed from the third batch of a bucket on.
+        """Run the forward pass of a training step, replayed from the third batch of a bucket on.
 
-        A batch with tall subjects, whose sizes are no bucket, or of a model with hooks is called
-        eagerly.
+        Batches with tall subjects or without a bucket, and models with hooks, run eagerly.
 
         Args:
-            batch: on the device of the training, with targets; :meth:`captures`.
-            scale: factor of the loss (``16-mixed``), without dimensions; None: 1.
+            batch: on the device of the training, with targets; :meth:`captures` holds.
+            scale: scalar factor of the loss (``16-mixed``); None: 1.
         """
         predictor = self.predictor
         with predictor.model.rounds.drawn():
@@ -161,7 +145,7 @@ class CapturedStep:
             return self._captured(prepared, seen, scale)
 
     def _prepare(self, batch: Batch) -> Prepared:
-        """What precedes the stages, with a plan of sizes that rarely change."""
+        """Preprocess and plan a batch, with sizes that rarely change."""
         shape = tuple(batch.masks.shape)
         encoder = self.predictor.model.encoder
         view = (*shape, encoder.tokens, encoder.margin)
@@ -174,20 +158,13 @@ class CapturedStep:
         return prepared
 
     def _captured(self, prepared: Prepared, seen: Batch, scale: Tensor | None) -> Outcome:
-        """The loss, whose gradients come from a graph.
-
-        Args:
-            prepared: the preprocessed batch.
-            seen: the batch that was given, without names.
-            scale: factor of the loss; None: 1.
-        """
+        """Compute the loss with gradients from a captured graph; ``seen`` is the original batch."""
         one_pass = _Pass(self.predictor, self.renderer, self.losses)
         weights = {name: weight for name, weight in one_pass.named_parameters() if weight.requires_grad}
 
         def differentiated(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple]:
             *inputs, scale = inputs
-            # Gradients of the weights themselves would be summed on the stream that first
-            # needed them.
+            # Twins: gradients of the weights themselves would be accumulated on another stream.
             twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
             with torch.enable_grad():
                 total, values = functional_call(one_pass, twins, tuple(inputs))
@@ -210,15 +187,11 @@ class CapturedStep:
         return Outcome(known, values, sum(prepared.plan.counts))
 
     def state_dict(self) -> list[tuple[tuple, tuple]]:
-        """Shape buckets as plain data: a run that goes on from them computes the same."""
+        """Shape buckets as plain data: a resumed run with the same buckets computes the same."""
         return [(key, _plain(sizes)) for key, sizes in self.buckets.items()]
 
     def load_state_dict(self, state: Sequence[tuple[tuple, tuple]]) -> None:
-        """Go on with the shape buckets of a checkpoint.
-
-        Args:
-            state: of :meth:`state_dict`.
-        """
+        """Restore the shape buckets of :meth:`state_dict`."""
         for key, (*rows, window) in state:
             self.buckets[tuple(key)] = Sizes(*rows, Window(*(Span(*span) for span in window)))
 
@@ -229,16 +202,8 @@ def _plain(sizes: Sizes) -> tuple:
 
 
 def _differentiated(total: Tensor, weights: Sequence[Tensor], scale: Tensor | None) -> list[Tensor | None]:
-    """Gradients of a loss, of float16 as large as those of its multiple.
-
-    Args:
-        total: the loss.
-        weights: of which some may take no part.
-        scale: factor of the loss; None: 1.
-
-    Returns:
-        The gradient of the loss itself for each weight.
-    """
+    """Gradients of a loss for each weight, None for unused ones; computed on ``scale * total`` and divided
+    by ``scale``, against underflow in float16."""
     with torch.autocast(total.device.type, enabled=False):
         if scale is None:
             return list(torch.autograd.grad(total, weights, allow_unused=True))
@@ -251,7 +216,7 @@ def _differentiated(total: Tensor, weights: Sequence[Tensor], scale: Tensor | No
 
 
 def _laid_out(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
-    """A gradient in the layout of its weight: PyTorch would copy others, one by one."""
+    """Convert a gradient to the layout of its weight; otherwise PyTorch would copy each separately."""
     if gradient is None or gradient.stride() == weight.stride():
         return gradient
     return torch.empty_like(weight).copy_(gradient)
