@@ -21,7 +21,7 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.evaluation.report import measure_and_write, table_of
+from ghgs_lit.evaluation.report import format_means, measure_and_write
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.processes import (
@@ -328,7 +328,7 @@ def measure_last(
     summary = read_results(path)["summary"]
     changes = RunDirectory(directory).swept or overrides()
     values = loggers.hyperparameters(run.plain, choices(), changes)
-    table = table_of(summary, "github")
+    table = format_means(summary, "github")
     loggers.log_results(trainer.loggers, values, summary, table, trainer.global_step)
     announce(path)
     return summary[0]["psnr"]

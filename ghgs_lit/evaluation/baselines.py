@@ -74,13 +74,13 @@ def photo_depth(batch: Batch) -> Tensor:
     bounds = batch.once(hull_bounds)
     consistency = photo_consistency(batch, bounds, DEPTHS)
     radius = max(round(WINDOW * max(batch.masks.shape[-2:])), 1)
-    weights = (_shared(consistency, batch.masks, radius) / SOFTNESS).softmax(2)
+    weights = (_average_in_window(consistency, batch.masks, radius) / SOFTNESS).softmax(2)
     shares = (torch.arange(DEPTHS, device=weights.device, dtype=weights.dtype) + 0.5) / DEPTHS
     share = torch.einsum("bvshw,s->bvhw", weights, shares)
     return (bounds.near + (bounds.far - bounds.near) * share) * batch.masks
 
 
-def _shared(values: Tensor, masks: Tensor, radius: int) -> Tensor:
+def _average_in_window(values: Tensor, masks: Tensor, radius: int) -> Tensor:
     """Average ``values`` [B, V, S, H, W] over the subject's pixels in a window around each pixel."""
     inside = masks.to(values.dtype)
     counts = _window_mean(inside, radius)
@@ -202,7 +202,7 @@ def true_depth(batch: Batch) -> Tensor:
     return batch.depths
 
 
-def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
+def render_discs(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
     """Render discs at given depths; where the batch has mattes, also at pixels of the rim.
 
     Args:
@@ -335,7 +335,7 @@ def baseline(
     """
     choice("baselines", name, BASELINES)
     if name in DEPTH_OF:
-        return partial(splatted, depth_of=DEPTH_OF[name], renderer=renderer)
+        return partial(render_discs, depth_of=DEPTH_OF[name], renderer=renderer)
     if name == "per_scene":
         return PerScene(renderer, per_scene.steps)
     if name == "untrained":

@@ -123,7 +123,7 @@ def _surface_errors(batch: Batch, gaussians: Gaussians) -> list[float | None]:
     return [surface_error_mm(own.means, own.opacities, surface).item() for own, surface in pairs]
 
 
-def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
+def _make_rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
     targets = batch.targets
     (b, t) = batch.targets.images.shape[:2]
     depths = None if targets.depths is None else targets.depths.flatten(0, 1)
@@ -153,7 +153,7 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
     return rows
 
 
-def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
+def _save_pictures(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
     """Save a picture of one subject for each protocol: inputs, depths, targets, renders and errors."""
     for protocol in dict.fromkeys(batch.targets.protocols):
         chosen = [p == protocol for p in batch.targets.protocols]
@@ -204,9 +204,9 @@ def measure(
         seconds = (time.perf_counter() - started) / len(batch.images)
         if pictures is not None:
             for element in range(min(picture_count, len(batch.images))):
-                _draw(batch, estimate, element, pictures, name)
+                _save_pictures(batch, estimate, element, pictures, name)
             picture_count = max(picture_count - len(batch.images), 0)
-        rows += [{"method": name, **row, "seconds": seconds} for row in _rows(batch, estimate, metrics)]
+        rows += [{"method": name, **row, "seconds": seconds} for row in _make_rows(batch, estimate, metrics)]
     return rows
 
 

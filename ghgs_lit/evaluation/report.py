@@ -84,11 +84,11 @@ def measure_and_write(
         },
         **facts,
     )
-    print(table_of(summarize(rows)), flush=True)
+    print(format_means(summarize(rows)), flush=True)
     return write_results(directory, rows, source)
 
 
-def table_of(summary: Sequence[Row], form: str = "simple") -> str:
+def format_means(summary: Sequence[Row], form: str = "simple") -> str:
     """Format means over subjects as a table.
 
     Args:

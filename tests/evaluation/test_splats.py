@@ -9,13 +9,13 @@ from ghgs_lit.config import run_of
 from ghgs_lit.evaluation.baselines import (
     CHANGES,
     PerScene,
-    _shared,
+    _average_in_window,
     discs_at,
     hull_bounds,
     hull_depth,
     photo_depth,
+    render_discs,
     splats_at,
-    splatted,
     true_depth,
 )
 from ghgs_lit.geometry.masks import with_matte
@@ -66,7 +66,7 @@ def test_pixels_that_show_little_of_the_subject_have_discs_too():
     batch = with_soft_rims(make_batch(1, 2))
     own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1])
     deep = torch.where(batch.depths > 0, batch.depths, 2.0)
-    found = splatted(dataclasses.replace(batch, targets=own, depths=deep), true_depth, RENDERER)
+    found = render_discs(dataclasses.replace(batch, targets=own, depths=deep), true_depth, RENDERER)
     expected = batch.alpha > 0.125
     assert torch.equal(found.depth_valid, expected)
     assert expected.sum() > (batch.masks & expected).sum()
@@ -136,7 +136,7 @@ def test_evidence_is_shared_inside_the_subject_only():
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(2, 3, 4, 9, 7, generator=generator)
     masks = torch.rand(2, 3, 9, 7, generator=generator) > 0.4
-    found = _shared(values, masks, 2)
+    found = _average_in_window(values, masks, 2)
     for b, v, row, column in masks.nonzero()[::11].tolist():
         window = (b, v, slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3))
         part = values[window[0], window[1], :, window[2], window[3]]

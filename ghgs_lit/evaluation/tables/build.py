@@ -52,11 +52,11 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
     layout = options.layout
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")
-    sweep = _runs_of_layout(sweep, options)
+    sweep = _select_runs(sweep, options)
     ours = sweep.rows
     if options.subjects is not None:
-        ours = _selected(ours, options.subjects, "the runs")
-        others = [_selected(rows, options.subjects, rows["source"].iloc[0]) for rows in others]
+        ours = _select_subjects(ours, options.subjects, "the runs")
+        others = [_select_subjects(rows, options.subjects, rows["source"].iloc[0]) for rows in others]
     if options.targets:
         expected = f"some of {', '.join(dict.fromkeys(ours['targets']))}, on which the runs were measured"
         ours = ours[ours["targets"].isin(options.targets)]
@@ -75,14 +75,14 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         if source not in shown:
             keys = [_describe(part, same) for part in parts]
             raise InputError(f"{source}: expected results on one of {keys}; found {_describe(theirs, same)}")
-    return [_table(part, sweep, options) for part in parts]
+    return [_build_table(part, sweep, options) for part in parts]
 
 
 def _describe(rows: pd.DataFrame, names: list[str]) -> str:
     return ", ".join(f"{name}={rows.iloc[0][name]}" for name in names)
 
 
-def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
+def _select_subjects(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
     """Rows of the subjects whose whole names match, and means, which have no subject."""
     is_kept = [not isinstance(name, str) or names.fullmatch(name) is not None for name in rows["subject"]]
     expected = f"a match with the whole name of a subject of {where}, such as {rows['subject'].iloc[0]}"
@@ -90,7 +90,7 @@ def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.Data
     return rows[is_kept]
 
 
-def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
+def _select_runs(sweep: Sweep, options: TableOptions) -> Sweep:
     """Select the runs of a layout.
 
     They have its numbers of views and, if any run has, the paper's data. Tables of ablations exclude
@@ -122,7 +122,7 @@ def _reported_data(layout: Layout) -> list[str]:
     return paper()["tables"][layout.reported]["data"].split(" and ") if layout.reported else []
 
 
-def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
+def _build_table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     layout = options.layout
     is_ablation = layout.rows == "ablation"
     trained = {variant.trained for variant in rows["variant"]}
@@ -137,7 +137,7 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     variants = sorted(variants, key=lambda v: (_KINDS.index(v.kind), place.get(v, len(place))))
     stub = ("3D Unproj.", "Semantic Cons.") if is_ablation else ("Methods",)
     lines = _ablation_lines(variants) if is_ablation else _method_lines(variants)
-    groups = _groups(rows, planned, options)
+    groups = _make_groups(rows, planned, options)
     left_out = len(sweep.configs.keys() - set(sweep.rows["source"]))
     table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, left_out)
     if layout.reported and options.reported:
@@ -157,7 +157,7 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     return table
 
 
-def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -> list[Group]:
+def _make_groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -> list[Group]:
     layout = options.layout
     views = options.views or layout.views
     if layout.columns == "views":

@@ -12,7 +12,7 @@ from ghgs_lit.errors import InputError, choice
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of, paper
 from ghgs_lit.evaluation.tables.runs import TRAINING
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
-from ghgs_lit.evaluation.tables.variants import ABSENT, describe, differing
+from ghgs_lit.evaluation.tables.variants import ABSENT, describe, find_differences
 
 
 def fill(table: Table) -> None:
@@ -26,7 +26,7 @@ def fill(table: Table) -> None:
             cell differ.
     """
     values = _values(table)
-    _refuse_rivals(table, values)
+    _reject_rivals(table, values)
     # Runs with the same numbers count once.
     cell_and_seed = [*CELL, "seed"]
     values = values[values["source"] == values.groupby(cell_and_seed)["source"].transform("first")]
@@ -36,8 +36,8 @@ def fill(table: Table) -> None:
     cells = seeds.groupby(CELL).agg(**means, count=("count", "first"), runs=("run", " ".join))
     shape = (range(len(table.lines)), range(len(table.groups)), table.metrics)
     cells = cells.reindex(pd.MultiIndex.from_product(shape, names=CELL))
-    cells["mean"] = cells["mean"].fillna(_reported(table))
-    cells["lacking"] = _lacking(table, cells["seeds"])
+    cells["mean"] = cells["mean"].fillna(_reported_figures(table))
+    cells["lacking"] = _missing_seeds(table, cells["seeds"])
     table.cells = cells.assign(best=False, marked=False, test=None)
     # Without baselines: some of them read the ground truth.
     competing = [i for i, line in enumerate(table.lines) if line.variant.kind in ("model", "other")]
@@ -47,7 +47,7 @@ def fill(table: Table) -> None:
     if table.options.test.against != "none":
         for name in table.tested:
             choice("test.metrics", name, tuple(table.metrics))
-        _test(table, _by_person(table, values), competing)
+        _test(table, _values_by_person(table, values), competing)
 
 
 def _values(table: Table) -> pd.DataFrame:
@@ -67,30 +67,32 @@ def _values(table: Table) -> pd.DataFrame:
     return rows.melt(facts, var_name="metric").dropna(subset="value")
 
 
-def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
+def _reject_rivals(table: Table, values: pd.DataFrame) -> None:
     """Reject different numbers for one cell and seed, and different configurations in one cell."""
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
         if part["value"].nunique() > 1:
-            raise _rivals(table, (line, group), list(part["source"]), f"one run for %s, seed {seed}")
+            raise _rival_error(table, (line, group), list(part["source"]), f"one run for %s, seed {seed}")
     for cell, column in values.groupby(["line", "group"], sort=False)["source"]:
         sources = list(dict.fromkeys(column))
-        for key, texts in _differing(table, sources).items():
+        for key, texts in _find_differences(table, sources).items():
             # Keys depend on the package's version, folders on the machine.
             if len({*texts} - {ABSENT}) > 1 and not is_below(key, OF_A_PLACE):
-                raise _rivals(table, cell, sources, "one configuration for %s")
+                raise _rival_error(table, cell, sources, "one configuration for %s")
 
 
-def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
+def _find_differences(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
     """Keys beyond ``OF_A_RUN`` in which configurations of the runs' models differ."""
-    return differing([table.configs[source] for source in sources if source in table.configs], OF_A_RUN)
+    return find_differences(
+        [table.configs[source] for source in sources if source in table.configs], OF_A_RUN
+    )
 
 
-def _rivals(table: Table, cell: tuple[int, int], sources: Sequence[str], expected: str) -> InputError:
+def _rival_error(table: Table, cell: tuple[int, int], sources: Sequence[str], expected: str) -> InputError:
     """The error for several runs in one cell, with the keys of ``by`` that give each its own row."""
     variant = table.lines[cell[0]].variant
     row = f"ablation={variant.ablation}" if variant.ablation else variant.name
-    keys = _differing(table, sources)
+    keys = _find_differences(table, sources)
     cure = f"they differ in {describe(keys)}: by=[{','.join(keys)}] gives each a row"
     return InputError(
         f"runs: expected {expected % f'{row}, {table.groups[cell[1]].views} views'}; found"
@@ -99,7 +101,7 @@ def _rivals(table: Table, cell: tuple[int, int], sources: Sequence[str], expecte
     )
 
 
-def _reported(table: Table) -> pd.Series:
+def _reported_figures(table: Table) -> pd.Series:
     """The paper's figures by ``CELL``."""
     figures = {}
     for number, line in enumerate(table.lines):
@@ -114,7 +116,7 @@ def _reported(table: Table) -> pd.Series:
     return pd.Series(figures, dtype=float)
 
 
-def _lacking(table: Table, measured: pd.Series) -> list[tuple[int, ...]]:
+def _missing_seeds(table: Table, measured: pd.Series) -> list[tuple[int, ...]]:
     """Seeds of planned runs without results that would fill each cell."""
     planned = defaultdict(set)
     for run, (number, group) in product(table.planned, enumerate(table.groups)):
@@ -141,7 +143,7 @@ def _mark_best(table: Table, means: pd.Series, arrow: str) -> None:
         table.cells.loc[means.index[means == means.iloc[0]], "best"] = True
 
 
-def _by_person(table: Table, values: pd.DataFrame) -> pd.DataFrame:
+def _values_by_person(table: Table, values: pd.DataFrame) -> pd.DataFrame:
     """Values that can be tested, by cell and seed (index) and by person (columns)."""
     values = values[values["subject"].notna() & ~values["metric"].isin(TRAINING)]
     person = values["subject"]
@@ -164,7 +166,7 @@ def _test(table: Table, people: pd.DataFrame, competing: pd.Series) -> None:
     unprinted = []
     for column in product(range(len(table.groups)), table.tested):
         means = competing[[cell[1:] == column for cell in competing.index]]
-        reference, is_chosen = _reference(table, means)
+        reference, is_chosen = _find_reference(table, means)
         if reference is None:
             continue
         rows = {cell: people.loc[cell] for cell in means.index}
@@ -185,7 +187,7 @@ def _test(table: Table, people: pd.DataFrame, competing: pd.Series) -> None:
         table.cells.at[cell, "test"] = test
 
 
-def _reference(table: Table, means: pd.Series) -> tuple[tuple | None, bool]:
+def _find_reference(table: Table, means: pd.Series) -> tuple[tuple | None, bool]:
     """The cell that the others of a column are compared with, and whether it was chosen by its
     figures.
 

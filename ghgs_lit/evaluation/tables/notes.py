@@ -7,7 +7,7 @@ import pandas as pd
 
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, metric_of, paper
 from ghgs_lit.evaluation.tables.significance import POWER
-from ghgs_lit.evaluation.tables.variants import ablation_sets, describe, differing
+from ghgs_lit.evaluation.tables.variants import ablation_sets, describe, find_differences
 
 MARK = "*"
 FOOTNOTE = (
@@ -110,8 +110,8 @@ def write_notes(table: Table) -> list[str]:
             for p in table.planned
         ]
         notes.append(f"No results yet (in progress or cut off): {_first_of(list(dict.fromkeys(names)))}.")
-    notes += _about_test(table, [variant.ablation for variant in models])
-    if keys := _differing(table, ours, {"checkpoint", *set().union(*sets.values())}):
+    notes += _describe_test(table, [variant.ablation for variant in models])
+    if keys := _find_differences(table, ours, {"checkpoint", *set().union(*sets.values())}):
         notes.append(f"Runs side by side differ also in {describe(keys)}.")
     states = sorted(table.rows["git"].dropna().unique())
     if len(states) > 1:
@@ -123,7 +123,7 @@ def _first_of(names: list[str]) -> str:
     return "; ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _differing(table: Table, ours: pd.DataFrame, shown: set[str]) -> dict[str, list[str]]:
+def _find_differences(table: Table, ours: pd.DataFrame, shown: set[str]) -> dict[str, list[str]]:
     """Keys in which runs of a row, or of all rows of ablations, differ, except for those in
     ``shown``."""
     groups: dict[tuple, list] = {}
@@ -134,11 +134,11 @@ def _differing(table: Table, ours: pd.DataFrame, shown: set[str]) -> dict[str, l
         groups.setdefault(() if table.is_ablation else row, []).append(table.configs[source])
     keys = {}
     for group in groups.values():
-        keys |= differing(group)
+        keys |= find_differences(group)
     return {key: values for key, values in keys.items() if key not in shown}
 
 
-def _about_test(table: Table, ablations: list[str]) -> list[str]:
+def _describe_test(table: Table, ablations: list[str]) -> list[str]:
     """Meaning of the marks, and the smallest difference that the seeds and subjects could show."""
     tests = table.cells["test"].dropna()
     known = [test for test in tests if test.p is not None]

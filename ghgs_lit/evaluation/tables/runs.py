@@ -143,13 +143,13 @@ def _read_training(path: Path) -> dict[str, Any] | None:
     return config
 
 
-def natural(text: str) -> list[str | float]:
+def natural_sort_key(text: str) -> list[str | float]:
     """Sort key that compares numbers in texts by value: ``k=10`` comes after ``k=9``."""
     parts = re.split(r"(\d+(?:\.\d+)?(?:e[-+]?\d+)?)", text)
     return [float(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
-def _in_order(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[str, Variant]) -> list[str]:
+def _sort_paths(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[str, Variant]) -> list[str]:
     """Sort files of runs by folder, then as in the sweep's command, then by the names of their rows."""
     commands = {sweep: runs_in_order(sweep) for sweep in {Path(path).parent.parent for path in paths}}
 
@@ -158,12 +158,18 @@ def _in_order(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[s
         folder = [run.is_relative_to(folder) for folder in folders].index(True)
         names = commands[run.parent]
         number = names.index(run.name) if run.name in names else len(names)
-        return folder, natural(str(run.parent)), number, natural(str(variants.get(path))), natural(path)
+        return (
+            folder,
+            natural_sort_key(str(run.parent)),
+            number,
+            natural_sort_key(str(variants.get(path))),
+            natural_sort_key(path),
+        )
 
     return sorted(paths, key=place)
 
 
-def _files_below(folders: Sequence[Path], name: str) -> list[Path]:
+def _find_files(folders: Sequence[Path], name: str) -> list[Path]:
     paths = itertools.chain.from_iterable(sorted(folder.rglob(name)) for folder in folders)
     return [path for path in paths if path.parent.name != ".hydra"]
 
@@ -185,8 +191,8 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         if not folder.is_dir():
             found = "a file" if folder.is_file() else "none"
             raise FileNotFoundError(f"{folder}: expected a directory of runs; found {found}")
-    runs = {str(path): _read_run(path) for path in _files_below(folders, "metrics.json")}
-    trainings = {str(path): _read_training(path) for path in _files_below(folders, "config.yaml")}
+    runs = {str(path): _read_run(path) for path in _find_files(folders, "metrics.json")}
+    trainings = {str(path): _read_training(path) for path in _find_files(folders, "config.yaml")}
     trainings = {path: config for path, config in trainings.items() if config is not None}
     if not runs:
         names = ", ".join(map(str, folders))
@@ -203,7 +209,7 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     variants = name_variants(configs, list(dict.fromkeys([*by, *find_keys_of_rows(configs.values())])))
     frames = []
     planned = []
-    paths = _in_order({**runs, **trainings}, folders, variants)
+    paths = _sort_paths({**runs, **trainings}, folders, variants)
     for path in paths:
         if path in runs:
             rows = runs[path][0]

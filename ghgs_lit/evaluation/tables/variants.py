@@ -85,7 +85,7 @@ class Variant:
 
 
 @cache
-def _shipped(group: str) -> dict[str, dict]:
+def _read_shipped(group: str) -> dict[str, dict]:
     return {path.stem: read_yaml(path) for path in (conf_dir() / group).glob("*.yaml")}
 
 
@@ -103,7 +103,7 @@ def encoder_name(config: Mapping[str, Any]) -> str:
     encoder = encoder if isinstance(encoder, Mapping) else {}
     branch = ", semantic branch" * (encoder.get("semantic") is not None)
     values = flatten({key: encoder.get(key) for key in _ENCODER_KEYS})
-    for name, shipped in sorted(_shipped("encoder").items()):
+    for name, shipped in sorted(_read_shipped("encoder").items()):
         # A file overrides single keys of nested mappings.
         if flatten({key: shipped.get(key) for key in _ENCODER_KEYS}).items() <= values.items():
             return name + branch
@@ -134,7 +134,7 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     encoder = encoder_name(config)
     # A user-defined option of conf/model can have the name of the one that it is based on.
     model = lookup(config, "chosen.model")
-    if model is None or model in _shipped("model"):
+    if model is None or model in _read_shipped("model"):
         model = str(lookup(config, "model.name") or "unnamed")
     model += f", compat {compat}" * (compat not in (None, "none"))
     # A user-defined ablation is a row of the model's table, not another model. The paper's ablations
@@ -196,7 +196,7 @@ def name_variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -
     return {path: replace(variant, ablation=names[keys[path]]) for path, variant in variants.items()}
 
 
-def differing(
+def find_differences(
     configs: Sequence[Mapping[str, Any]], expected: Iterable[str] = EXPECTED_TO_DIFFER
 ) -> dict[str, list[str]]:
     """Find the dotted keys in which configurations differ.
@@ -218,6 +218,6 @@ def differing(
 
 
 def describe(keys: Mapping[str, Sequence[str]]) -> str:
-    """The first keys and values of :func:`differing`, such as ``optimizer.lr (0.001, 0.0001)``."""
+    """The first keys and values of :func:`find_differences`, such as ``optimizer.lr (0.001, 0.0001)``."""
     shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:6]]
     return ", ".join(shown) + (f" and {len(keys) - 6} more" if len(keys) > 6 else "")

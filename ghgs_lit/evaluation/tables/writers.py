@@ -29,7 +29,7 @@ Write = Callable[[str, str, bool], str]
 """Formats a cell from its number, the text after the number, and whether it is best."""
 
 
-def _cell(cell: Any, write: Write) -> str:
+def _format_cell(cell: Any, write: Write) -> str:
     """Format a cell: number, deviation over seeds, mark, interval of its difference, missing seeds."""
     if pd.isna(cell.mean):
         return write("missing" if cell.lacking else NO_FIGURE, "", False)
@@ -45,15 +45,15 @@ def _cell(cell: Any, write: Write) -> str:
     return write(f"{cell.mean:.{digits}f}", tail, cell.best)
 
 
-def _texts(table: Table, write: Write) -> pd.DataFrame:
+def _format_cells(table: Table, write: Write) -> pd.DataFrame:
     """Formatted cells: a row for each line, columns by group and metric."""
-    cells = [_cell(cell, write) for cell in table.cells.itertuples()]
+    cells = [_format_cell(cell, write) for cell in table.cells.itertuples()]
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
 def _blocks(table: Table, write: Write) -> dict[str, list[tuple[str, list[str]]]]:
     """Kind and cells of each line by the title of its block: reported lines, then measured ones."""
-    numbers = _texts(table, write)
+    numbers = _format_cells(table, write)
     blocks: dict[str, list[tuple[str, list[str]]]] = {}
     for number, (variant, stub) in enumerate(table.lines):
         is_reported = variant.kind == "reported"
@@ -88,7 +88,7 @@ def to_markdown(table: Table) -> str:
 def to_terminal(table: Table) -> str:
     """Write the table for a terminal, with caption and notes; each group of columns has its own
     lines, which limits the width."""
-    numbers = _texts(table, lambda number, tail, best: number + tail + BEST * best)
+    numbers = _format_cells(table, lambda number, tail, best: number + tail + BEST * best)
     rows = []
     for (i, line), (number, group) in itertools.product(enumerate(table.lines), enumerate(table.groups)):
         mark = "† " if line.variant.kind == "reported" else ""
@@ -106,13 +106,13 @@ def to_csv(tables: Sequence[Table]) -> str:
     lines = []
     for number, table in enumerate(tables, 1):
         for cell in table.cells.itertuples():
-            lines.append({"table": number, **_about_row(table, cell), **_figures(table, cell)})
+            lines.append({"table": number, **_describe_row(table, cell), **_figures(table, cell)})
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
 
 
-def _about_row(table: Table, cell: Any) -> dict[str, Any]:
+def _describe_row(table: Table, cell: Any) -> dict[str, Any]:
     """Row, setting and metric of a cell, by column of the CSV file."""
     variant, stub = table.lines[cell.Index[0]]
     group = table.groups[cell.Index[1]]
@@ -184,13 +184,13 @@ def escape(text: str) -> str:
     return text.translate(str.maketrans(_ESCAPES))
 
 
-def prose(text: str) -> str:
+def markdown_to_latex(text: str) -> str:
     """Convert Markdown with ``**bold**`` and names in backticks to LaTeX."""
     text = re.sub(r"\*\*([^*]+)\*\*", r"\\textbf{\1}", escape(text))
     return re.sub(r"`([^`]*)`", r"\\texttt{\1}", text)
 
 
-def _number(number: str, tail: str, best: bool) -> str:
+def _format_number(number: str, tail: str, best: bool) -> str:
     number = rf"\textbf{{{number}}}" if best else escape(number)
     return number + escape(tail).replace(MARK, "$^{*}$")
 
@@ -228,7 +228,7 @@ def _tabular(table: Table) -> str:
     """The ``tabular`` environment, with rules above blocks."""
     rows = [rf"\begin{{tabular}}{{{_columns(table)}}}", r"\toprule", *_head(table)]
     count = len(table.stub)
-    for title, lines in _blocks(table, _number).items():
+    for title, lines in _blocks(table, _format_number).items():
         rows.append(r"\midrule")
         if table.reported_on:
             title = rf"\multicolumn{{{len(lines[0][1])}}}{{l}}{{\emph{{{escape(title)}}}}} \\"
@@ -244,12 +244,12 @@ def _tabular(table: Table) -> str:
 def to_latex(table: Table, label: str) -> str:
     """Write a float with the table, its caption, notes in small print, and label; requires
     ``PREAMBLE``."""
-    notes = "\n".join(rf"{prose(note)}\par" for note in table.notes)
+    notes = "\n".join(rf"{markdown_to_latex(note)}\par" for note in table.notes)
     parts = {
         "float": "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table",
         "tabular": _tabular(table),
         "notes": f"\\par\\smallskip\n\\parbox{{\\linewidth}}{{\\footnotesize\n{notes}\n}}\n" if notes else "",
-        "caption": prose(table.caption),
+        "caption": markdown_to_latex(table.caption),
         "label": label,
     }
     return _FLOAT % parts

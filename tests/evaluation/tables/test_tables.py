@@ -23,7 +23,7 @@ from ghgs_lit.evaluation.tables import (
     to_terminal,
 )
 from ghgs_lit.evaluation.tables.variants import encoder_name
-from ghgs_lit.evaluation.tables.writers import escape, prose
+from ghgs_lit.evaluation.tables.writers import escape, markdown_to_latex
 from ghgs_lit.runs.results import config_hash, read_results, summarize, write_results
 from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, other, views
 from tests.helpers.tables import tables_of, write_run
@@ -81,8 +81,11 @@ def test_text_of_all_kinds_is_escaped():
     assert escape("a_b & 50% #1 {x} ^~\\ $") == (
         r"a\_b \& 50\% \#1 \{x\} \textasciicircum{}\textasciitilde{}\textbackslash{} \$"
     )
-    assert prose("**No** `a_b` (✗, ✓) ± 1") == r"\textbf{No} \texttt{a\_b} (\xmark{}, \cmark{}) $\pm$ 1"
-    assert prose("* differs, p < 0.05") == r"* differs, p \textless{} 0.05"
+    assert (
+        markdown_to_latex("**No** `a_b` (✗, ✓) ± 1")
+        == r"\textbf{No} \texttt{a\_b} (\xmark{}, \cmark{}) $\pm$ 1"
+    )
+    assert markdown_to_latex("* differs, p < 0.05") == r"* differs, p \textless{} 0.05"
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX engine")
