@@ -99,6 +99,15 @@ def nothing_is_left_to_the_next_test() -> Iterator[None]:
             handler.close()
 
 
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Tensors of tests are small: more threads would only wait for one another."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def pytest_collection_finish() -> None:
     gc.freeze()
 

@@ -41,13 +41,7 @@ WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
 REFERENCE = Renderer(backend="reference")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Images of this size gain nothing from threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def full_batch(count=2):

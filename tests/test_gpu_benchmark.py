@@ -20,14 +20,6 @@ from tests.helpers.pretend_device import DEVICE
 TINY = dataclasses.replace(DRY, side=28, batches=(1,), large_batches=(1,), large=28)
 
 
-@pytest.fixture
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.mark.filterwarnings("ignore:CUDA is not available")
 @pytest.mark.parametrize("section", ["machine", "step"])
 def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):

@@ -6,16 +6,8 @@ import operator
 import pytest
 import torch
 
-from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
-from ghgs_lit.types import Batch
 from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
-
-
-def element(batch, b):
-    """One element of a batch."""
-    one = slice(b, b + 1)
-    return Batch(batch.images[one], batch.masks[one], batch.cameras[one], depths=batch.depths[one])
 
 
 def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background():
@@ -25,27 +17,6 @@ def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background
     with torch.no_grad():
         fast, exact = (predict(make_model(f"skip={skip}"), batch).gaussians for skip in ("fast", "exact"))
     close(fast, exact)
-
-
-@pytest.mark.parametrize("margin", [0, 1])
-@torch.no_grad()
-def test_skip_fast_with_few_pixels_and_with_mates(margin):
-    """An empty view, a single pixel, two people and a second element: same pixels, and each element as if
-    alone."""
-    batch = make_batch(2, 4, zoom=0.4)
-    batch.masks[0, 0] = False
-    batch.masks[0, 1] = False
-    batch.masks[0, 1, 20, 33] = True
-    batch.masks[1, 2, :4, :4] = batch.masks[1, 2, -3:, -3:] = True
-    model = make_model("skip=fast", f"skip.margin={margin}").eval()
-    together = predict(model, batch)
-    assert torch.equal(together.depth_valid, batch.masks)
-    assert len(together.gaussians) == batch.masks.sum()
-    for name in ("means", "quaternions", "scales", "opacities", "colors"):
-        assert getattr(together.gaussians, name).isfinite().all()
-    assert len(together.points.tokens) < 2 * 4 * 4 * 4
-    for b in range(2):
-        close(together.gaussians[b], predict(model, element(batch, b)).gaussians)
 
 
 def test_only_windows_around_the_subject_are_decoded():
@@ -96,13 +67,3 @@ def test_tokens_of_windows_give_gaussians_of_the_same_pixels(size):
     for name in ("near", "far"):
         near = (getattr(prediction.depth_maps.bounds, name)[batch.masks] for prediction in (part, whole))
         assert torch.equal(*near)
-    # Points lie on the rays of their pixels in the whole image.
-    camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
-    uv, _ = project(
-        part.points.pixels,
-        batch.cameras.intrinsics[:, :, None, None],
-        batch.cameras.extrinsics[:, :, None, None],
-    )
-    centers = pixel_centers(*size, camera).expand_as(uv)
-    assert torch.allclose(uv[batch.masks], centers[batch.masks], atol=1e-3)
-    assert torch.allclose(camera[..., 2][batch.masks], part.depth[batch.masks], atol=1e-4)

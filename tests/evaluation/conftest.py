@@ -1,18 +1,13 @@
 """Rendered boxes for all tests of evaluation."""
 
 import pytest
-import torch
 
 from tests.helpers.people import render_boxes
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Run on one thread: small images gain nothing from more, and lose much where cores are shared."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+def _one_thread(one_thread):
+    """Every test of this folder has one thread."""
 
 
 @pytest.fixture(scope="session")

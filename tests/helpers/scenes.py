@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 
 from ghgs_lit.data.imperfections import perturb_cameras
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.types import Batch, Cameras, Targets
+from ghgs_lit.types import Batch, Cameras, Gaussians, Targets
 from tests.helpers.cameras import camera_ring
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -88,6 +88,17 @@ def with_soft_rims(batch):
     alpha = torch.nn.functional.avg_pool2d(batch.masks.float(), 3, 1, 1)
     images = torch.rand(batch.images.shape, generator=torch.Generator().manual_seed(8))
     return replace(batch, images=images * alpha[:, :, None], masks=alpha >= 0.5, alpha=alpha)
+
+
+def surface_splats(batch):
+    """A small opaque Gaussian at the true point of each pixel of the subject."""
+    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    means = unproject_maps(batch.depths, batch.cameras).flatten(0, 1).flatten(1, 2)[image, pixel]
+    colors = batch.images.flatten(0, 1).flatten(2).mT[image, pixel]
+    n, counts = len(image), tuple(batch.masks.flatten(1).sum(1).tolist())
+    turns = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
+    sizes, opacities = torch.full((n, 3), 0.004), torch.full((n,), 0.9)
+    return Gaussians(means, turns, sizes, opacities, colors, counts, image, pixel)
 
 
 def training_batch(batch=1, size=28, views=3):

@@ -16,7 +16,7 @@ CARD = Path(__file__).parents[2] / "docs" / "model_card.md"
 
 def test_they_are_what_a_model_without_a_path_has_and_name_no_machine():
     model, config = load_model(), read_checkpoint("shipped")["config"]
-    assert model.rounds.height is not None
+    assert model.rounds.height == config["rounds"]["height"] == 202
     assert not model.training
     assert not re.search(r"/(tmp|work|home|root)\b", json.dumps(config))
 

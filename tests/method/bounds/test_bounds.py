@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.method.bounds import NoBounds, SubjectBox, VisualHull
+from ghgs_lit.method.bounds import SubjectBox, VisualHull
 from ghgs_lit.method.bounds.box import subject_box
 from ghgs_lit.method.bounds.rays import cut_sides, depths_in_box, dilate, silhouettes, votes_outside
 from ghgs_lit.types import Batch, DepthBounds
@@ -204,23 +204,6 @@ def test_autocast_changes_nothing():
     with torch.autocast("cpu", torch.bfloat16):
         found = near_and_far(VisualHull(), batch)
     assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
-
-
-def test_elements_of_a_batch_do_not_mix():
-    """A result must not depend on the other subjects of its batch."""
-    batch = make_batch(2, 3)
-    together = near_and_far(VisualHull(), batch)
-    for b in range(2):
-        part = slice(b, b + 1)
-        one = Batch(batch.images[part], batch.masks[part], batch.cameras[part])
-        alone = near_and_far(VisualHull(), one)
-        for x, y in zip(together, alone, strict=True):
-            torch.testing.assert_close(x[b], y[0], atol=1e-3, rtol=0)
-
-
-def test_no_bounds_are_none():
-    """Depths of the release's model must not be bounded by accident."""
-    assert NoBounds()(make_batch()) is None
 
 
 @pytest.mark.parametrize(

@@ -143,19 +143,6 @@ def test_background_is_as_if_no_attention_saw_it(vit, tokens, margin):
     _same(tokens.semantic, torch.cat([patches for _, patches in elements])[image, row * COLUMNS + column])
 
 
-@pytest.mark.parametrize("vit", VITS, ids=lambda vit: vit["kind"])
-@pytest.mark.parametrize("tokens", ["window", "subject"])
-@torch.no_grad()
-def test_a_full_mask_gives_the_tokens_of_all(vit, tokens):
-    """Where there is no background, nothing changes."""
-    images, masks = _people()
-    masks = torch.ones_like(masks)
-    found, expected = (_encoder(vit, tokens=kept)(images, masks) for kept in (tokens, "all"))
-    assert found.is_dense
-    for a, b in zip((*found.latent, found.semantic), (*expected.latent, expected.semantic), strict=True):
-        assert torch.equal(a, b)
-
-
 @torch.no_grad()
 def test_kept_patches_that_are_given_take_part():
     """Patches of the plan, not the encoder's own choice, become tokens."""

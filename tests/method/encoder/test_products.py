@@ -179,7 +179,7 @@ def test_frozen_blocks_record_no_gradient(monkeypatch, trainable, recorded):
     assert seen == [False] * (4 - recorded) + [True] * recorded
 
 
-@pytest.mark.parametrize("model", ["paper", "hull"])
+@pytest.mark.parametrize("model", ["paper", "hull", "recurrent"])
 def test_predictions_in_bfloat16_stay_near_and_geometry_is_float32(model):
     """Half precision changes predictions little and never rounds geometry."""
     module = make_model(f"model={model}").eval()

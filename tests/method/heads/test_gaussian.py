@@ -119,17 +119,6 @@ def test_rim_pixels_have_the_subjects_color_and_the_opacity_of_their_share():
     assert torch.equal(soft.means, plain.means)
 
 
-def test_gaussians_name_their_pixels_in_order():
-    """Tables, pictures and pasting rely on the pixel of each Gaussian."""
-    batch = make_batch(2, 3, 56, 42)
-    gaussians = run(make_head(), batch)
-    assert gaussians.splits == tuple(batch.masks.flatten(1).sum(1).tolist())
-    image, row, column = batch.masks.flatten(0, 1).nonzero(as_tuple=True)
-    assert torch.equal(gaussians.image, image)
-    assert torch.equal(gaussians.pixel, row * 42 + column)
-    assert (gaussians[1].image >= 3).all()
-
-
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_attributes_stay_within_their_bounds(scale):
     """No raw value may give a giant, transparent or distant splat."""

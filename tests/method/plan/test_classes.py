@@ -18,13 +18,7 @@ PRESETS = ["none", "exact", "balanced", "fast"]
 WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Images this small gain nothing from threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Neighbours against their definition: ties, few points, points of all sizes."""
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -108,11 +106,3 @@ def test_at_each_place_of_the_image_plane_the_own_view_comes_first():
     near = nearest_neighbors(module.positions(tokens, points), tokens.image, 5, places, views)
     turn = (tokens.image[near] - tokens.image[:, None]) % 4
     assert torch.equal(turn, torch.tensor([0, 1, 2, 3, 0]).expand(64, 5))
-
-
-def test_neighbors_are_searched_without_a_gradient():
-    """Who is near is no reason to move a point."""
-    tokens, points = scene()
-    points = dataclasses.replace(points, tokens=points.tokens.clone().requires_grad_())
-    for neighborhood in ("xyz", "image_plane"):
-        assert not make_stage(neighborhood=neighborhood).positions(tokens, points).requires_grad

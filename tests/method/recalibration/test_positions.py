@@ -10,7 +10,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.frame import places_around
 from ghgs_lit.method.plan import make_plan
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
-from tests.helpers.tokens import literal_neighbors, make_stage, scene
+from tests.helpers.tokens import literal_attention, make_stage, scene
 
 
 def relative_stage(**options):
@@ -28,30 +28,6 @@ def at(points, places):
     return dataclasses.replace(points, tokens=places)
 
 
-def literal_values(stage, x, points):
-    """Outputs of one element, one query, head and neighbour at a time, for s = 1."""
-    block = stage.block
-    around = points - points.mean(0)
-    places = around / around.square().sum(1).mean().sqrt()
-    normed = block.norm1(x)
-    q, k, v = (
-        layer(normed).unflatten(1, (block.num_heads, -1))
-        for layer in (block.q_proj, block.k_proj, block.v_proj)
-    )
-    maps = block.place_proj.weight.unflatten(0, (block.num_heads, -1))
-    rows = []
-    for i in range(len(x)):
-        near = literal_neighbors(points, i, stage.k)
-        heads = []
-        for a in range(block.num_heads):
-            weights = torch.stack([q[i, a] @ k[j, a] for j in near]).div(q.shape[-1] ** 0.5).softmax(0)
-            values = [v[j, a] + maps[a] @ (places[j] - places[i]) for j in near]
-            heads.append(sum(weight * value for weight, value in zip(weights, values, strict=True)))
-        rows.append(torch.cat(heads))
-    x = x + block.o_proj(torch.stack(rows))
-    return x + block.mlp(block.norm2(x))
-
-
 def test_a_neighbour_says_where_it_lies():
     """Against a loop over queries, heads and neighbours."""
     tokens, points = scene()
@@ -61,7 +37,9 @@ def test_a_neighbour_says_where_it_lies():
     found = stage(tokens, points)
     for element in range(2):
         chosen = (points.tokens_valid & (tokens.image // 3 == element)).nonzero()[:, 0]
-        expected = literal_values(stage, tokens.latent[1][chosen], points.tokens[chosen])
+        expected = literal_attention(
+            stage.block, tokens.latent[1][chosen], points.tokens[chosen], tokens.semantic[chosen], stage.k
+        )
         torch.testing.assert_close(found.latent[1][chosen], expected, atol=1e-12, rtol=0)
 
 
@@ -76,30 +54,6 @@ def test_training_starts_as_without():
         torch.testing.assert_close(layer, expected)
     found.latent[0].square().sum().backward()
     assert (on.block.place_proj.weight.grad.abs() > 0).all()
-
-
-def test_neither_the_origin_nor_the_unit_of_the_world_matters():
-    """A person 100 m away, in millimetres; and only differences of places are told."""
-    tokens, points = scene()
-    tokens = double(tokens)
-    stage = relative_stage()
-    here = stage(tokens, at(points, points.tokens.double()))
-    away = stage(tokens, at(points, 1000 * (points.tokens.double() + torch.tensor([100.0, -50.0, 7.0]))))
-    other = stage(tokens, at(points, points.tokens.double() * torch.tensor([1.0, 1.0, -1.0])))
-    torch.testing.assert_close(away.latent, here.latent, atol=1e-9, rtol=0)
-    assert (other.latent[0] - here.latent[0])[points.tokens_valid].abs().max() > 0.1
-
-
-def test_the_order_of_neighbours_does_not_matter():
-    torch.manual_seed(0)
-    block = relative_stage().block
-    x = torch.randn(9, 32, dtype=torch.float64)
-    places = torch.randn(9, 3, dtype=torch.float64)
-    near = torch.stack([torch.randperm(9)[:5] for _ in range(9)])
-    cosines = torch.rand(9, 5, dtype=torch.float64)
-    order = torch.randperm(5)
-    found = block(x, Neighborhood(near[:, order], cosines[:, order], places=places))
-    torch.testing.assert_close(found, block(x, Neighborhood(near, cosines, places=places)))
 
 
 @pytest.mark.parametrize("scores", [1 << 26, 0], ids=["product", "gathered"])

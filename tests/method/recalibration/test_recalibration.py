@@ -5,52 +5,21 @@ from typing import get_args
 
 import pytest
 import torch
-import torch.nn.functional as F
 
-import ghgs_lit.method.recalibration.recalibration as stage
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
 from ghgs_lit.method.recalibration.recalibration import (
-    S_MIN,
     RecalibrationOptions,
     Similarity,
     neighbor_count,
 )
 from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
 from tests.helpers.scenes import CASES, fixture
-from tests.helpers.tokens import literal_neighbors, make_stage, scene
+from tests.helpers.tokens import literal_attention, make_stage, scene
 
 SIMILARITIES = get_args(Similarity)
 FIXTURES = ["sc3d_n200", "sc3d_b2_n150", "sc3d_small_variance"]
-
-
-def literal_attention(block, x, points, semantic, k):
-    """Eqs. 3 to 5 and the residual network for one element, one query and one head at a time."""
-    normed = block.norm1(x)
-    q, key, v = (
-        p(normed).unflatten(1, (block.num_heads, -1)) for p in (block.q_proj, block.k_proj, block.v_proj)
-    )
-    rows = []
-    for i in range(len(x)):
-        near = literal_neighbors(points, i, k)
-        heads = []
-        for a in range(block.num_heads):
-            scores = []
-            for j in near:
-                score = q[i, a] @ key[j, a] / q.shape[-1] ** 0.5
-                s = F.cosine_similarity(semantic[i], semantic[j], dim=0)
-                score = {
-                    "product": score * s,
-                    "product_clamped": score * s.clamp(min=0),
-                    "log": score + s.clamp(min=S_MIN).log(),
-                    "none": score,
-                }[block.similarity]
-                scores.append(score)
-            heads.append(torch.stack(scores).softmax(0) @ v[near, a])
-        rows.append(torch.cat(heads))
-    x = x + block.o_proj(torch.stack(rows))
-    return x + block.mlp(block.norm2(x))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -106,16 +75,6 @@ def test_other_tokens_pass_unchanged_and_all_takes_them_in():
     assert torch.equal(changed, points.tokens_valid)
     every = make_stage(tokens="all")(tokens, points)
     assert (every.latent[2] != tokens.latent[2]).any(1).all()
-
-
-def test_neighbors_are_searched_once_an_element(monkeypatch):
-    """Neighbours are not searched again for each layer."""
-    calls = []
-    search = stage.nearest_neighbors
-    monkeypatch.setattr(stage, "nearest_neighbors", lambda *args: calls.append(1) or search(*args))
-    tokens, points = scene()
-    make_stage()(tokens, points)
-    assert len(calls) == 2
 
 
 def test_a_share_of_the_tokens_is_a_number_for_each_element():

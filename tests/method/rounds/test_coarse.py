@@ -5,8 +5,6 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import run_of
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.method.model import with_known_height
@@ -18,7 +16,7 @@ from ghgs_lit.method.rounds.coarse import (
     spread_tokens,
 )
 from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
-from tests.helpers.models import close, load_model, make_model, predict
+from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import in_dtype, make_batch, with_soft_rims
 
 #: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
@@ -199,50 +197,6 @@ def test_the_training_says_what_height_the_weights_know(trained, height, side):
             masks[:, 1, :rows, :3] = True  # the tallest view decides
             sizes = coarse_sizes(dataclasses.replace(larger, masks=masks), height, 1)
             assert (sizes != [None]) == is_copied
-
-
-@pytest.fixture(scope="module")
-def shipped():
-    return load_model()
-
-
-def without_copies(model, batch):
-    """The prediction with ``rounds.height=null``."""
-    before = model.rounds.options
-    model.rounds.options = before.replace(height=None)
-    found = predict(model, batch)
-    model.rounds.options = before
-    return found
-
-
-def person(folder, side):
-    """A built-in person in four photographs, with depths;
-    photographs of other sizes are smaller copies."""
-    said = [f"data.size={side}", "data.render={size: 322, positions: [0, 4, 8, 12], views: [0]}"]
-    said += ["data=synthetic", "data.people={train: 1, val: 1}", f"data.cache_dir={folder}"]
-    run = run_of("evaluate", ["checkpoint=shipped", *said])
-    data = build_data(run.replace(targets=None))
-    data.prepare_data()
-    return data.evaluation_batch("p0000000", "train", views=4)
-
-
-def error(prediction, batch):
-    return (prediction.depth - batch.depths)[batch.masks].abs().mean().item()
-
-
-@torch.no_grad()
-def test_a_larger_photograph_is_placed_better_with_the_weights_of_the_package(shipped, tmp_path):
-    """Than at once, and than a photograph of the size of the training,
-    which is predicted as ever."""
-    assert shipped.rounds.height == 202
-    assert shipped.config["rounds"]["height"] == 202
-    small, large = person(tmp_path, 252), person(tmp_path, 322)
-    of_large = error(predict(shipped, large), large)
-    of_small = predict(shipped, small)
-    print(of_large, error(without_copies(shipped, large), large), error(of_small, small))
-    assert of_large < 0.9 * error(without_copies(shipped, large), large)
-    assert of_large < 0.95 * error(of_small, small)
-    close(of_small.gaussians, without_copies(shipped, small).gaussians, 0)
 
 
 @pytest.mark.parametrize("pad", ["none", "multiple"])

@@ -66,15 +66,6 @@ def test_windows_give_what_whole_images_give():
     assert np.allclose(found.detach().numpy(), expected(exchange, raw, known), rtol=0, atol=1e-12)
 
 
-def test_gradients_in_float64():
-    masks = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
-    masks[0, 2:4, 5:8] = True
-    raw, batch = scene(masks)
-    windows, exchange = Windows.of(raw, batch), trained()
-    known = torch.randn(len(raw.image), KNOWN, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: exchange(x, windows), (known,))
-
-
 @pytest.mark.parametrize("filled", [[], [1]])
 def test_images_without_a_subject(filled):
     masks = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.bool)

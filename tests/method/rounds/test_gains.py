@@ -10,9 +10,8 @@ import torch
 from ghgs_lit.data.imperfections import draw_color_gains
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.rounds.gains import divided, equalized, log_gains, log_gammas
-from ghgs_lit.types import Gaussians
 from tests.helpers.models import make_model, predict
-from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, with_soft_rims
+from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, surface_splats, with_soft_rims
 
 
 def waves(points):
@@ -34,17 +33,6 @@ def painted(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
     return dataclasses.replace(batch, images=colors * batch.masks[:, :, None])
 
 
-def splats(batch):
-    """Discs at the true points."""
-    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
-    n, counts = len(image), tuple(batch.masks.flatten(1).sum(1).tolist())
-    means = unproject_maps(batch.depths, batch.cameras).flatten(0, 1).flatten(1, 2)[image, pixel]
-    colors = batch.images.flatten(0, 1).flatten(2).mT[image, pixel]
-    turn = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
-    sizes = torch.full((n, 3), 0.01)
-    return Gaussians(means, turn, sizes, torch.full((n,), 0.95), colors, counts, image, pixel)
-
-
 def seen_with(batch, gains):
     return dataclasses.replace(batch, images=batch.images * torch.as_tensor(gains)[..., None, None].float())
 
@@ -60,23 +48,19 @@ def test_gains_are_found(seed):
     batch = painted(2)
     gains = drawn(batch, seed)
     dark = seen_with(batch, gains)
-    found = log_gains(splats(dark), dark)
+    found = log_gains(surface_splats(dark), dark)
     assert np.abs(np.log(gains)).max() > 0.1
     np.testing.assert_allclose(found, np.log(gains), atol=0.03)
-    before, after = ((x.images - batch.images).abs().mean() for x in (dark, equalized(splats(dark), dark)[1]))
+    before, after = (
+        (x.images - batch.images).abs().mean() for x in (dark, equalized(surface_splats(dark), dark)[1])
+    )
     assert after < 0.2 * before
-
-
-def test_equal_cameras_stay_as_they_are():
-    """The estimate's own error is not taken for a gain."""
-    batch = painted(2)
-    assert log_gains(splats(batch), batch).abs().max() < 2e-3
 
 
 def test_differences_below_the_error_of_the_estimate_are_left():
     """Half a percent between cameras is as likely an error of the depths."""
     batch = painted()
-    found = log_gains(splats(batch), seen_with(batch, np.exp(drawn(batch, stops=0.02) - 1)))
+    found = log_gains(surface_splats(batch), seen_with(batch, np.exp(drawn(batch, stops=0.02) - 1)))
     assert 0 < found.abs().max() < 1e-3
 
 
@@ -88,7 +72,7 @@ def test_highlights_do_not_decide():
     images = dark.images.clone()
     first, last = dark.masks[0, 0].nonzero()[:, 1].float().quantile(torch.tensor([0.3, 0.6])).int()
     images[:, 0, :, :, first:last] *= 0.5
-    found = log_gains(splats(dark), dataclasses.replace(dark, images=images))
+    found = log_gains(surface_splats(dark), dataclasses.replace(dark, images=images))
     np.testing.assert_allclose(found, np.log(gains), atol=0.03)
 
 
@@ -97,7 +81,7 @@ def test_what_a_view_does_not_see_does_not_count():
     batch = painted(views=6, spread=360.0, paint=halves)
     gains = drawn(batch)
     dark = seen_with(batch, gains)
-    np.testing.assert_allclose(log_gains(splats(dark), dark), np.log(gains), atol=0.02)
+    np.testing.assert_allclose(log_gains(surface_splats(dark), dark), np.log(gains), atol=0.02)
 
 
 def test_dark_rims_do_not_count():
@@ -110,7 +94,7 @@ def test_dark_rims_do_not_count():
     dark = seen_with(soft, gains)
     images = dark.images.clone()
     images[:, 0] *= torch.where(dark.alpha[:, 0] < 0.9, 0.8, 1.0)[:, None]
-    found = log_gains(splats(soft), dataclasses.replace(dark, images=images))
+    found = log_gains(surface_splats(soft), dataclasses.replace(dark, images=images))
     np.testing.assert_allclose(found, np.log(gains), atol=0.03)
 
 
@@ -124,18 +108,20 @@ def test_colours_without_a_ratio_do_not_count(kind):
     dark = seen_with(batch, gains)
     level = torch.tensor([0.0025 * (kind == "black"), 0, 0, 0])[:, None, None, None]
     images = (dark.images + level).clamp(max=1) * batch.masks[:, :, None]
-    found = log_gains(splats(batch), dataclasses.replace(dark, images=images))
+    found = log_gains(surface_splats(batch), dataclasses.replace(dark, images=images))
     np.testing.assert_allclose(found, np.log(gains), atol=0.03)
 
 
 def test_batch_mates_change_nothing():
     both = painted(2)
     dark = seen_with(both, drawn(both))
-    together = log_gains(splats(dark), dark)
+    together = log_gains(surface_splats(dark), dark)
     for b in range(2):
         parts = {name: getattr(dark, name)[[b]] for name in ("images", "masks", "cameras", "depths")}
         alone = dataclasses.replace(dark, **parts)
-        torch.testing.assert_close(log_gains(splats(alone), alone), together[[b]], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(
+            log_gains(surface_splats(alone), alone), together[[b]], atol=1e-5, rtol=1e-4
+        )
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
@@ -143,8 +129,8 @@ def test_photographs_that_say_nothing_have_no_gains(value):
     """Black or white all over; and no Gaussians at all."""
     batch = painted()
     flat = dataclasses.replace(batch, images=torch.full_like(batch.images, value))
-    assert not log_gains(splats(flat), flat).any()
-    nothing = splats(batch).select(slice(0, 0), (0,))
+    assert not log_gains(surface_splats(flat), flat).any()
+    nothing = surface_splats(batch).select(slice(0, 0), (0,))
     assert not log_gains(nothing, batch).any()
 
 
@@ -197,4 +183,4 @@ def test_the_gamma_of_each_camera_is_found(view, gamma):
     wrong = dataclasses.replace(batch, images=images)
     expected = torch.zeros(2, 4, 3)
     expected[1, view] = math.log(gamma)
-    torch.testing.assert_close(log_gammas(splats(wrong), wrong), expected, atol=0.04, rtol=0)
+    torch.testing.assert_close(log_gammas(surface_splats(wrong), wrong), expected, atol=0.04, rtol=0)

@@ -7,38 +7,20 @@ import pytest
 import torch
 
 from ghgs_lit.geometry.masks import coverage, on_black
-from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.method.rounds.observation import SLOPES, looked_up, observe, slopes
 from ghgs_lit.ops.observation import CHANNELS
 from ghgs_lit.rendering import render
-from ghgs_lit.types import Batch, Gaussians
-from tests.helpers.scenes import make_batch, with_soft_rims
-
-
-def splats(batch):
-    """A small opaque Gaussian at the true point of each pixel of the subject."""
-    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
-    means = unproject_maps(batch.depths, batch.cameras).flatten(0, 1).flatten(1, 2)[image, pixel]
-    own = batch.images.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
-    n = len(means)
-    return Gaussians(
-        means,
-        torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
-        torch.full((n, 3), 0.004),
-        torch.full((n,), 0.9),
-        own,
-        tuple(batch.masks.flatten(1).sum(1).tolist()),
-        image,
-        pixel,
-    )
+from ghgs_lit.types import Batch
+from tests.helpers.scenes import make_batch, surface_splats, with_soft_rims
 
 
 @pytest.mark.parametrize("size", [(56, 56), (42, 84)])
 def test_a_gaussian_sees_itself_in_its_own_view(size):
     """Colour equal to the photograph's, inside the mask, not hidden."""
     batch = make_batch(2, 3, *size)
-    gaussians = splats(batch)
+    gaussians = surface_splats(batch)
     each = observe(gaussians, batch)
     assert each.shape == (len(gaussians), 3, CHANNELS)
     own = each[:, 0]
@@ -51,7 +33,7 @@ def test_a_gaussian_sees_itself_in_its_own_view(size):
 def test_what_lies_behind_the_surface_is_hidden():
     """Against the true depths of the pixels that Gaussians fall on."""
     batch = make_batch(1, 4)
-    gaussians = splats(batch)
+    gaussians = surface_splats(batch)
     each = observe(gaussians, batch)[..., 8]
     for view in range(4):
         # The own view is the first; the others follow in their order.
@@ -67,29 +49,10 @@ def test_what_lies_behind_the_surface_is_hidden():
         assert behind[own].abs().mean() < 0.3
 
 
-def test_batch_mates_change_nothing():
-    both = make_batch(2, 3)
-    gaussians = splats(both)
-    each = observe(gaussians, both)
-    for b in range(2):
-        alone = dataclasses.replace(
-            both,
-            images=both.images[b : b + 1],
-            masks=both.masks[b : b + 1],
-            cameras=both.cameras[b : b + 1],
-            depths=None,
-        )
-        own = gaussians[b]
-        own = dataclasses.replace(own, image=own.image - 3 * b)
-        found = observe(own, alone)
-        chosen = gaussians.image // 3 == b
-        assert torch.allclose(found, each[chosen], atol=1e-5)
-
-
 @pytest.mark.parametrize("means", [torch.tensor([[0.1, 0.9, 50.0]]), torch.tensor([[1e6, 0.0, 0.0]])])
 def test_outside_of_all_images_everything_is_0(means):
     batch = make_batch(1, 2)
-    one = splats(batch).select(slice(0, 1), (1,))
+    one = surface_splats(batch).select(slice(0, 1), (1,))
     each = observe(dataclasses.replace(one, means=means), batch)
     assert each.isfinite().all()
     assert not each[each[..., 9] == 0][:, :9].any()
@@ -97,7 +60,7 @@ def test_outside_of_all_images_everything_is_0(means):
 
 def test_what_is_not_finite_reaches_no_other_element():
     batch = make_batch(3, 2)
-    gaussians = splats(batch)
+    gaussians = surface_splats(batch)
     expected = observe(gaussians, batch)
     colors = gaussians.colors.clone()
     element = gaussians.image // 2
@@ -110,8 +73,8 @@ def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
     """Gaussians with the subject's colours and its share as opacity;
     the share takes the mask's place."""
     batch = with_soft_rims(make_batch(1, 2))
-    plain = observe(splats(batch), dataclasses.replace(batch, alpha=None))
-    each = observe(splats(batch), batch)
+    plain = observe(surface_splats(batch), dataclasses.replace(batch, alpha=None))
+    each = observe(surface_splats(batch), batch)
     assert torch.equal(each[..., :6], plain[..., :6])
     between = [((found[..., 6] > 0.05) & (found[..., 6] < 0.95)).sum() for found in (each, plain)]
     assert between[0] > between[1]
@@ -120,7 +83,7 @@ def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
 def test_errors_are_the_photograph_minus_the_render():
     """Splats that are too dark have positive errors, those of their own pixel."""
     batch = make_batch(1, 3)
-    dark = splats(batch)
+    dark = surface_splats(batch)
     dark = dataclasses.replace(dark, colors=0.5 * dark.colors)
     error = batch.images - render(dark, batch.cameras).image
     expected = error.flatten(0, 1).flatten(2).mT[dark.image, dark.pixel]
@@ -132,7 +95,7 @@ def test_errors_are_the_photograph_minus_the_render():
 
 def slanted(batch):
     """Splats that do not fit: moved, of three sizes, half transparent."""
-    gaussians = splats(batch)
+    gaussians = surface_splats(batch)
     generator = torch.Generator().manual_seed(3)
     moved = 0.01 * torch.randn(gaussians.means.shape, generator=generator)
     sizes = 0.01 * (1 + torch.rand(gaussians.scales.shape, generator=generator))
@@ -209,7 +172,7 @@ def test_elements_of_different_sizes_are_looked_up_as_one_by_one():
     """Elements are padded to one number of Gaussians: what pads is in no result,
     also beside one of none."""
     batch = make_batch(3, 3, 42, 56)
-    whole = splats(batch)
+    whole = surface_splats(batch)
     first, _, last = (whole[i] for i in range(3))
     few = torch.cat((torch.arange(7), len(first) + len(whole[1]) + torch.arange(len(last))))
     gaussians = whole.select(few, (7, 0, len(last)))

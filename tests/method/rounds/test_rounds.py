@@ -117,16 +117,6 @@ def test_gradients_reach_every_weight_and_every_round_is_supervised():
     assert torch.isclose(terms.depth(prediction, rendering, batch), torch.stack(error).sum(), rtol=1e-5)
 
 
-def test_half_precision_gives_finite_values():
-    batch, kicked = make_batch(1, 3), model(kick=0.5)
-    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
-        found = predict(kicked, batch)
-    for name in ATTRIBUTES:
-        value = getattr(found.gaussians, name)
-        assert value.dtype == torch.float32, name
-        assert value.isfinite().all(), name
-
-
 def test_options_are_checked():
     with pytest.raises(InputError, match=r"rounds\.exchange: expected an integer >= 1 and <= 65536 or null"):
         RoundsOptions(exchange=0)
