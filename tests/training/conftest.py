@@ -1,4 +1,4 @@
-"""Trainings that several files of tests share."""
+"""Fixtures of trainings that several test files share."""
 
 import functools
 
@@ -9,7 +9,8 @@ from tests.training.test_resume import Cut, fit
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory):
-    """Trains with a number of batches in a step, once: the folder, the module, the validations."""
+    """Train once per number of accumulated batches; returns the folder, the module and the
+    validations."""
 
     @functools.cache
     def run(accumulate: int):

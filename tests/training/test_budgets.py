@@ -1,5 +1,5 @@
-"""Random budgets of tokens: each is a preset of skipping,
-and the draw depends on the step alone."""
+"""Random token budgets: each corresponds to a preset of skipping, and the sample depends only on the
+step."""
 
 from collections import Counter
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
 
 CLASSES = {"seed": 3, "data": {"class_steps": 4}}
-# The preset that is configured, a budget, and the preset that it is.
+# The configured preset, a budget, and the preset to which the budget corresponds.
 PRESETS = [
     ("fast", "all", ["skip=exact"]),
     ("exact", "window", ["skip=balanced"]),
@@ -28,7 +28,7 @@ PRESETS = [
 
 @pytest.mark.parametrize(("configured", "budget", "preset"), PRESETS)
 def test_a_budget_is_a_preset_while_it_lasts(configured, budget, preset):
-    """Training would see something else than the preset that its weights are meant for."""
+    """Otherwise weights would be trained on other tokens than those of the preset that they are for."""
     model, batch = make_model(f"skip={configured}"), make_batch(views=2, height=112, width=84)
     expected = make_model(*preset)
     expected.load_state_dict(model.state_dict())
@@ -40,7 +40,7 @@ def test_a_budget_is_a_preset_while_it_lasts(configured, budget, preset):
 
 
 def test_the_draw_is_even_and_depends_on_all_numbers():
-    """A step, a seed or a part of an accumulated step that does not count would repeat a budget."""
+    """If the step, the seed or the part of an accumulated step had no effect, budgets would repeat."""
     budgets = ["all", "window", 0, 0]
     drawn = [
         [drawn_budget(budgets, [seed, step, part]) for step in range(400)]
@@ -55,7 +55,7 @@ def test_the_draw_is_even_and_depends_on_all_numbers():
 
 
 class Watched(Standin):
-    """Keeps the budgets that it sees, in training and in validation."""
+    """Stand-in that records the budgets of training and of validation."""
 
     def __init__(self):
         super().__init__()
@@ -85,10 +85,10 @@ def fit(folder, steps, resume=None, class_steps=1):
 
 
 def test_a_resumed_run_draws_as_the_whole_one_and_validates_as_configured(tmp_path):
-    """Weights after an interruption would differ; a score would depend on the draw."""
+    """Otherwise weights would depend on interruptions, and scores on samples."""
     (tmp_path / "half").mkdir()
     whole, half = fit(tmp_path, 18), fit(tmp_path / "half", 12)
-    torch.manual_seed(99)  # what the process drew before must not matter
+    torch.manual_seed(99)  # the state of the global generator must not matter
     rest = fit(tmp_path / "half", 18, resume=tmp_path / "half" / "end.ckpt")
     assert whole.trained == half.trained + rest.trained
     assert len(set(whole.trained)) == 5
@@ -96,7 +96,8 @@ def test_a_resumed_run_draws_as_the_whole_one_and_validates_as_configured(tmp_pa
 
 
 def test_a_class_of_steps_has_one_budget_and_one_number_of_rounds(tmp_path):
-    """Also where it begins in the middle of a class."""
+    """A run of ``class_steps`` steps shares one budget and one number of rounds, also if training starts
+    within it."""
     trained = fit(tmp_path, 18, class_steps=6).trained
     assert [trained[first : first + 6] for first in (0, 6, 12)] == [[trained[n]] * 6 for n in (0, 6, 12)]
     assert len(set(trained)) > 1
@@ -115,6 +116,6 @@ def test_a_class_of_steps_has_one_budget_and_one_number_of_rounds(tmp_path):
 
 @pytest.mark.parametrize("choices", [[], ["windows"], [-1], ["all", "1"]])
 def test_budgets_that_do_not_exist_are_refused(choices):
-    """A typing error must not become another training."""
+    """A typing error must not lead to another training."""
     with pytest.raises(InputError, match="token_budgets"):
         Train(token_budgets=choices)

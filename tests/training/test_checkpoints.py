@@ -1,5 +1,5 @@
-"""Checkpoints are written whole, also on Ctrl-C and SIGTERM while training: after the step, with exit
-codes, and the same end."""
+"""Checkpoints are written atomically; on Ctrl-C and SIGTERM a run finishes its step, saves, exits with
+the signal's code, and resumes to the same result."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from tests.training.test_resume import Cut, fit, rows
 
 
 def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
-    """A kill in the middle of writing costs neither the previous checkpoint nor disk space."""
+    """A kill while writing loses no previous checkpoint and wastes no disk space."""
     path, files = tmp_path / "last.ckpt", AtomicCheckpointIO()
     files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
     child = os.fork()
@@ -41,7 +41,7 @@ def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
 
 
 def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
-    """After a power cut the file has its content: it is synced before it gets its name."""
+    """The file is synced before it is renamed, so that its content survives a power cut."""
     calls = []
     for name in ("fsync", "replace"):
         real = getattr(os, name)
@@ -51,8 +51,8 @@ def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
 
 
 def test_the_best_checkpoint_is_found_where_the_run_is(tmp_path, recwarn):
-    """In a folder that was moved; the score of one that is gone keeps no later one from being written.
-    States name files, never folders."""
+    """The state contains file names, not folders, so that a run can be moved; the score of a checkpoint
+    that no longer exists does not prevent later ones."""
     old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
     before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
     before.dirpath, after.dirpath = str(old), str(new)
@@ -73,7 +73,8 @@ def test_the_best_checkpoint_is_found_where_the_run_is(tmp_path, recwarn):
 
 
 def test_a_state_names_no_file_of_other_folders(tmp_path):
-    """Lightning deletes what a state calls the worst checkpoint."""
+    """Paths are restricted to the run's folder, as Lightning deletes the file that a state lists as the
+    worst checkpoint."""
     subject = CheckpointOptions(filename="best", monitor="val/psnr").build()
     subject.dirpath = str(tmp_path / "run" / "checkpoints")
     (tmp_path / "run" / "checkpoints").mkdir(parents=True)
@@ -85,8 +86,7 @@ def test_a_state_names_no_file_of_other_folders(tmp_path):
 
 
 class Signal(L.Callback):
-    """Sends a signal to this process in step ``at`` (counted from 1),
-    or in the validation after it."""
+    """Sends a signal to this process in step ``at`` (counted from 1), or in the validation after it."""
 
     def __init__(self, at: int, number: int, validating: bool = False, times: int = 1):
         self.at, self.number, self.validating, self.times = at, number, validating, times
@@ -105,7 +105,7 @@ class Signal(L.Callback):
 
 
 def stopped(folder, sender: Signal) -> int:
-    """Train until the signal; returns the exit code."""
+    """Train until the signal, and return the exit code."""
     with pytest.raises(Interrupted) as stop, interruptible():
         fit(folder, Cut(), more=[sender, StopAtStep()])
     return stop.value.code
@@ -126,8 +126,8 @@ def stopped(folder, sender: Signal) -> int:
 def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
     whole, tmp_path, number, at, validating, accumulate
 ):
-    """The step and a validation that is due are finished and saved: weights,
-    logs and validations agree."""
+    """The step and a due validation are finished and saved, so that weights, logs and validations agree
+    with those of an uninterrupted run."""
     options = {"accumulate_grad_batches": accumulate}
     folder, expected, validations = whole(accumulate)
     before = handlers()
@@ -147,7 +147,7 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
 
 
 def test_nothing_is_saved_between_the_parts_of_a_step(tmp_path):
-    """Their gradients would be lost."""
+    """A checkpoint between them would lose the gradients so far."""
 
     class Steps(AfterSteps):
         def after_step(self, trainer, pl_module):
@@ -159,8 +159,7 @@ def test_nothing_is_saved_between_the_parts_of_a_step(tmp_path):
 
 
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
-    """Who does not want to wait for the step is not made to;
-    one signal that arrives twice is one."""
+    """A repeated signal does not wait for the step, but one signal that is delivered twice counts once."""
     assert stopped(tmp_path / "twice", Signal(5, signal.SIGINT, times=2)) == 130
     assert (tmp_path / "twice" / "checkpoints" / "last.ckpt").exists()
     monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
@@ -169,7 +168,7 @@ def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
 
 
 def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path, monkeypatch):
-    """SIGTERM after SIGUSR1 does not mean that nobody waits for the step."""
+    """SIGTERM after SIGUSR1 still leaves time to finish the step."""
     monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
     sender = Signal(5, signal.SIGUSR1)
     sender.also = signal.SIGTERM
@@ -179,8 +178,8 @@ def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path,
 
 @pytest.mark.parametrize("error", [None, SystemExit(255), CalledProcessError(-15, "scontrol")])
 def test_a_batch_system_that_handles_signals_gets_a_checkpoint(tmp_path, error):
-    """submitit ignores SIGTERM and requeues on SIGUSR2, before which the step is saved; its handler
-    ends the process, returns where it is not the job's first, or fails as the job is ended."""
+    """submitit ignores SIGTERM and requeues on SIGUSR2. The step is saved before its handler, which exits
+    the process, returns (in processes other than the job's first), or fails because the job is ended."""
     seen = []
 
     def requeue(number, _):
@@ -204,7 +203,7 @@ def test_a_batch_system_that_handles_signals_gets_a_checkpoint(tmp_path, error):
 
 
 def test_forked_workers_do_not_act_for_their_parent():
-    """A worker that inherits the handlers must die of SIGTERM, and leave Ctrl-C to its parent."""
+    """A worker that inherits the handlers must be killed by SIGTERM, and leave Ctrl-C to its parent."""
     with interruptible():
         child = os.fork()
         if child == 0:
@@ -216,7 +215,7 @@ def test_forked_workers_do_not_act_for_their_parent():
 
 
 def test_other_threads_change_no_handlers():
-    """Python refuses handlers outside of the main thread, where some launchers run their jobs."""
+    """Python rejects handlers outside the main thread, where some launchers run their jobs."""
     before, errors = handlers(), []
 
     def work():

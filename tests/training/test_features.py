@@ -1,4 +1,4 @@
-"""Tokens of frozen ViTs on disk, and products of the encoder alone in bfloat16."""
+"""Disk cache of the tokens of a frozen ViT, and an encoder with bfloat16 products."""
 
 import logging
 import shutil
@@ -20,7 +20,7 @@ from tests.helpers.verbs import ghgs
 
 
 def frozen_encoder(seed=0, tokens="all", **options):
-    """An encoder whose ViT does not learn, in training."""
+    """An encoder in training mode whose ViT is frozen."""
     torch.manual_seed(seed)
     encoder = make_encoder(tokens, **{**SMALL_VGGT, **options}).train()
     for parameter in encoder.aggregator.patch_embed.parameters():
@@ -40,7 +40,8 @@ def batch():
 
 @pytest.mark.parametrize(("dtype", "bits"), [(torch.float16, 11), (torch.bfloat16, 8)])
 def test_tokens_from_disk_are_those_that_are_computed_up_to_rounding(tmp_path, batch, dtype, bits):
-    """And the same to the bit whether they were computed or read."""
+    """Tokens are bit-identical whether computed or read, and differ from uncached ones only by the
+    rounding of the stored type."""
     exact = frozen_encoder()(batch.images, batch.masks)
     encoder = with_cache(frozen_encoder(), tmp_path, dtype)
     cache = encoder.aggregator.patch_embed.cache
@@ -67,8 +68,7 @@ def test_what_learns_behind_the_cache_has_the_same_gradient(tmp_path, batch):
 
 
 def test_photographs_are_recognised_by_their_pixels(tmp_path, batch):
-    """In another order, in another batch, of another step;
-    one changed value is another photograph."""
+    """Images are found in another order, batch and step; one changed value makes another image."""
     encoder = with_cache(frozen_encoder(), tmp_path)
     cache = encoder.aggregator.patch_embed.cache
     first = encoder(batch.images, batch.masks)
@@ -84,7 +84,8 @@ def test_photographs_are_recognised_by_their_pixels(tmp_path, batch):
 
 
 def test_a_training_that_was_killed_goes_on_with_what_is_there(tmp_path, batch):
-    """Files that were lost, cut short by a full disk or left behind by a process that died."""
+    """Files that are missing, truncated by a full disk or left behind by a killed process are computed
+    again."""
     encoder = with_cache(frozen_encoder(), tmp_path)
     cache = encoder.aggregator.patch_embed.cache
     expected = encoder(batch.images, batch.masks)
@@ -104,8 +105,8 @@ def test_a_training_that_was_killed_goes_on_with_what_is_there(tmp_path, batch):
 
 
 def test_other_networks_and_precisions_have_other_tokens(tmp_path, batch):
-    """In folders of their own."""
-    round_products(False)  # whatever a trainer in this process has left
+    """Each network and precision has its own folder."""
+    round_products(False)  # reset what an earlier Trainer in this process has set
     round_products(False, "cpu")
     for network, dtype, half in (
         ("small", torch.float16, False), ("other", torch.float16, False), ("small", torch.bfloat16, False),
@@ -120,7 +121,7 @@ def test_other_networks_and_precisions_have_other_tokens(tmp_path, batch):
 
 
 def test_predictions_and_parts_of_photographs_are_computed(tmp_path, batch):
-    """The cache is for training on whole photographs."""
+    """The cache is used only in training on whole images."""
     encoder = with_cache(frozen_encoder(), tmp_path)
     exact = frozen_encoder()
     found = encoder.eval()(batch.images, batch.masks)
@@ -138,7 +139,7 @@ def test_values_beyond_half_precision_are_refused(tmp_path, batch):
 
 
 def test_the_encoder_alone_runs_in_bfloat16_where_the_device_has_it(batch, monkeypatch):
-    """Elsewhere in float32, with the same numbers as without the option."""
+    """On other devices it runs in float32, with the same result as without the option."""
     expected = frozen_encoder()(batch.images, batch.masks)
     encoder = frozen_encoder(precision="bfloat16")
     seen = []
@@ -156,7 +157,7 @@ def test_the_encoder_alone_runs_in_bfloat16_where_the_device_has_it(batch, monke
 
 
 def data_of(**augmentation):
-    """A data module of two people in 16 positions each."""
+    """Stand-in for a data module with two people in 16 positions each."""
     dataset = SimpleNamespace(size=(518, 512))
     subjects = {name: tuple(range(16)) for name in ("a", "b")}
     module = SimpleNamespace(dataset=dataset, augmentation=Augmentation(**augmentation))
@@ -165,8 +166,8 @@ def data_of(**augmentation):
 
 
 def test_it_says_how_much_room_it_needs_before_it_writes(tmp_path, caplog, monkeypatch):
-    """32 photographs of 37 x 37 patches, 32 channels of two bytes;
-    a full disk is found at the start."""
+    """The size is that of 32 images of 37 x 37 patches with 32 channels of two bytes; a full disk is
+    reported before training."""
     caplog.set_level(logging.INFO)
     model = SimpleNamespace(encoder=make_encoder(**SMALL_VGGT))
     options = DiskFeatureCache(folder=tmp_path / "features")
@@ -183,7 +184,7 @@ def test_it_says_how_much_room_it_needs_before_it_writes(tmp_path, caplog, monke
 
 
 def test_it_is_off_where_each_step_sees_other_photographs(tmp_path, caplog):
-    """But not where augmentation moves cameras alone."""
+    """It stays on if augmentation changes only cameras."""
     caplog.set_level(logging.INFO)
     model = SimpleNamespace(encoder=make_encoder(**SMALL_VGGT))
     options = DiskFeatureCache(folder=tmp_path)
@@ -205,7 +206,7 @@ def test_a_network_that_learns_has_no_cache(tmp_path, options):
 
 
 def test_a_run_and_its_rest_read_what_is_there(tmp_path, monkeypatch):
-    """From the command line: a run that is stopped, and its rest."""
+    """A run from the command line and its continuation share the cached tokens."""
     monkeypatch.chdir(tmp_path)
     boxes = tmp_path / "rendered"
     render_boxes(boxes, tmp_path / "scans", train=1, val=1)

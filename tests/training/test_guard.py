@@ -1,5 +1,5 @@
-"""A step that is not finite: its stage is named, its batch saved, and it is skipped or stops the run, in
-all processes alike."""
+"""Guard against steps that are not finite: it names the stage, saves the batch, and skips the step or
+stops the run, with the same decision in all processes."""
 
 import csv
 import dataclasses
@@ -29,7 +29,7 @@ CONFIG = {"seed": 1}
 
 
 def spoiled(batch):
-    """A batch whose second subject has a target that is not finite."""
+    """A copy of a batch in which the last subject has an infinite target."""
     images = batch.targets.images.clone()
     images[-1] = torch.inf
     return dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, images=images))
@@ -48,7 +48,7 @@ def loader(*bad: int, count: int = 6) -> DataLoader:
 
 
 class Depths(L.Callback):
-    """The model's depth after each step."""
+    """Records the model's depth after each step."""
 
     def __init__(self):
         self.seen = []
@@ -58,8 +58,8 @@ class Depths(L.Callback):
 
 
 def test_a_step_that_is_not_finite_is_skipped_and_counted(tmp_path, capsys):
-    """Weights and the optimizer stay as they were; one line says why;
-    the logs count, the rest is trained."""
+    """A skipped step changes neither weights nor the optimizer, prints one line and is counted in the logs;
+    the other steps are trained."""
     depths, subject = Depths(), module(limit=1)
     log = CsvLog(tmp_path, name="csv", version="", flush_logs_every_n_steps=1)
     run = trainer(tmp_path, 6, [depths], logger=log, log_every_n_steps=1)
@@ -87,7 +87,7 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted(tmp_path, capsys):
 
 
 def test_the_run_stops_after_the_allowed_steps_in_a_row(tmp_path):
-    """A run in which nothing is finite any more must not go on for days."""
+    """A diverged run must not continue for days."""
     subject = module(limit=2)
     with pytest.raises(DivergedError, match="step 4: "):
         trainer(tmp_path, 6).fit(subject, loader(0, 2, 3, 4))
@@ -96,7 +96,7 @@ def test_the_run_stops_after_the_allowed_steps_in_a_row(tmp_path):
 
 
 def test_one_part_of_an_accumulated_step_is_enough(tmp_path):
-    """The gradients of the other parts are lost with it: their sum is not finite."""
+    """The gradients of the other parts are dropped, too, as the sum is not finite."""
     depths = Depths()
     run = trainer(tmp_path, 3, [depths], accumulate_grad_batches=2)
     run.fit(module(limit=1), loader(2))
@@ -104,8 +104,8 @@ def test_one_part_of_an_accumulated_step_is_enough(tmp_path):
 
 
 def test_with_a_scaled_loss_the_guard_leaves_overflows_to_the_scaler(tmp_path):
-    """A loss that is not finite is the guard's, at any scale;
-    an overflow is how the scale is found."""
+    """The guard handles losses that are not finite at any scale; overflows of scaled gradients are left to
+    the scaler, which uses them to find its scale."""
     scaler = torch.amp.GradScaler("cpu", init_scale=2.0**127)
     subject, depths = module(limit=1, depth=100.0), Depths()
     run = trainer(tmp_path, 4, [depths], plugins=[MixedPrecision("16-mixed", "cpu", scaler)])
@@ -131,8 +131,8 @@ def real_module(folder, *overrides) -> GHGSModule:
 
 @pytest.mark.parametrize("overrides", [(), ("model=paper", "skip=none"), ("skip=balanced",)])
 def test_an_ordinary_step_has_no_fault(tmp_path, overrides):
-    """Values that are infinite on purpose would be blamed;
-    gradients of the weights must stay untouched."""
+    """Values that are infinite on purpose must not be reported, and gradients of the weights must stay
+    unchanged."""
     subject = real_module(tmp_path, *overrides)
     assert first_fault(subject, Step(training_batch(2), 1)) == ""
     assert all(p.grad is None for p in subject.parameters())
@@ -153,7 +153,7 @@ def infinite_slope(value):
     + [(stage, infinite_slope, "gradient from") for stage in STAGES[1:]],
 )
 def test_the_stage_where_values_are_first_not_finite_is_named(tmp_path, stage, change, place):
-    """Not the one that the value reaches later, or the gradient on its way back."""
+    """Stages that such a value reaches later, or its gradient in the backward pass, are not named."""
     subject = real_module(tmp_path)
     owner = subject if stage in ("renderer", "losses") else subject.model
     part = getattr(owner, stage)
@@ -166,7 +166,7 @@ def test_the_stage_where_values_are_first_not_finite_is_named(tmp_path, stage, c
 
 
 def test_a_weight_that_is_not_finite_is_named_and_the_batch_saved_as_plain_data(tmp_path):
-    """A stage that gets NaN is not at fault."""
+    """Stages whose inputs are already NaN are not named."""
     subject, name = real_module(tmp_path), "gaussian_head.scale_header.2.weight"
     subject.model.get_parameter(name).data.view(-1)[0] = torch.nan
     batches = DataLoader([training_batch(2)], batch_size=None, collate_fn=lambda b: b)
@@ -178,7 +178,7 @@ def test_a_weight_that_is_not_finite_is_named_and_the_batch_saved_as_plain_data(
 
 
 class Written(Depths):
-    """Writes what each process saw at the end."""
+    """Writes each process's skipped steps and depths at the end."""
 
     def on_train_end(self, run, pl_module):
         place = Path(run.default_root_dir) / f"end_{run.global_rank}"
@@ -186,7 +186,7 @@ class Written(Depths):
 
 
 class Own(torch.utils.data.DataLoader):
-    """Step 1 of the second process is not finite."""
+    """Loader in which step 1 of the second process is not finite."""
 
     def __iter__(self):
         return iter(loader(1) if torch.distributed.get_rank() == 1 else loader())
@@ -199,7 +199,7 @@ def train_in_two_processes(folder):
 
 
 def test_two_processes_skip_together(tmp_path):
-    """A process that goes on alone would wait for the others for ever, or train other weights."""
+    """A process that decided alone would wait for the others forever, or train other weights."""
     run_prepared(train_in_two_processes, tmp_path)
     first, second = (json.loads((tmp_path / f"end_{rank}").read_text()) for rank in range(2))
     assert first == second

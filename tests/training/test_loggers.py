@@ -1,4 +1,4 @@
-"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that continue."""
+"""Contents of TensorBoard and CSV logs (tags, times, memory, meshes, HParams), and their continuation."""
 
 import csv
 import dataclasses
@@ -41,7 +41,7 @@ def events(folder) -> EventAccumulator:
 
 
 def steps_in_files(folder, tag) -> list[int]:
-    """Steps of a tag as the files have them, without what TensorBoard would leave out."""
+    """Steps of a tag in the files themselves, including those that TensorBoard would hide."""
     found = [e for path in folder.glob("events.*") for e in EventFileLoader(str(path)).Load()]
     return sorted(e.step for e in found for value in e.summary.value if value.tag == tag)
 
@@ -59,7 +59,7 @@ def loggers(folder):
 
 
 class Staged(Standin):
-    """The simple model with some stages to time."""
+    """Stand-in model with two stages to time."""
 
     def __init__(self):
         super().__init__()
@@ -104,8 +104,8 @@ def run(tmp_path_factory):
 
 
 def test_tags_are_those_that_the_documentation_lists(run):
-    """No more and no fewer; TensorBoard sorts groups by name: losses and validations come first. Of
-    eight steps, logged every second, and two validations no chart has a single point, but for HParams."""
+    """The tags are exactly those, in groups whose names sort losses and validations first; after eight
+    steps, logged every second, and two validations only HParams has a single point."""
     found = events(run[0] / "tensorboard")
     tags = set(found.Tags()["scalars"])
     groups = {tag.split("/")[0] for kind in ("scalars", "images", "histograms") for tag in found.Tags()[kind]}
@@ -124,8 +124,7 @@ def test_tags_are_those_that_the_documentation_lists(run):
 
 
 def test_distributions_are_of_the_predicted_gaussians(run):
-    """At each validation; opacities and sizes in millimetres are those that the
-    stand-in predicts."""
+    """Histograms of each validation show the opacity and the size in millimetres of the stand-in."""
     found = events(run[0] / "tensorboard")
     for name, value in {"opacity": 0.9, "scale_mm": 10.0}.items():
         drawn = found.Histograms(f"values/{name}")
@@ -133,12 +132,12 @@ def test_distributions_are_of_the_predicted_gaussians(run):
         histogram = drawn[0].histogram_value
         assert (histogram.min, histogram.max) == pytest.approx((value, value))
         assert histogram.num > 100
-    # pixels of its Gaussians are not known
+    # The pixels of its Gaussians are unknown.
     assert "values/offset_mm" not in found.Tags()["histograms"]
 
 
 def test_offsets_are_distances_from_the_pixels_points():
-    """Of what the Gaussian head adds; values that are not finite are left out."""
+    """Offsets are in millimetres, without values that are not finite."""
     batch = example_batch()
     prediction = Standin()(batch)
     image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
@@ -153,7 +152,7 @@ def test_offsets_are_distances_from_the_pixels_points():
 
 
 def test_the_numbers_are_those_of_the_steps(run):
-    """Values are logged at the steps taken, and a step takes as long as its parts or longer."""
+    """Values are logged at the number of steps taken, and a step takes at least as long as its parts."""
     folder, subject = run
     found = events(folder / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("work/train/learning_rate")}
@@ -166,18 +165,18 @@ def test_the_numbers_are_those_of_the_steps(run):
     for place, whole in enumerate(found.Scalars("work/time_ms/step")):
         assert 0 < sum(found.Scalars(p)[place].value for p in parts) <= whole.value
     assert 10 < found.Scalars("work/memory_mb/process")[0].value < 1e6
-    # of one of two subjects, in three views of 8 x 6 pixels
+    # One subject in three views of 8 x 6 pixels.
     assert {event.value for event in found.Scalars("work/train/gaussians")} == {144.0}
-    # each term is logged before its weight, of which the total is the sum
+    # Terms are logged unweighted, and the total is their weighted sum.
     terms = [found.Scalars(f"loss/{name}") for name in ("total", "render_l1", "chamfer")]
     for total, l1, chamfer in zip(*terms, strict=True):
         assert total.value == pytest.approx(0.8 * l1.value + chamfer.value, rel=1e-5)
-    assert subject.renderer is flat_renderer  # evaluation is not slowed down by hooks
+    assert subject.renderer is flat_renderer  # no wrapper or hook remains
     assert not subject.model.encoder._forward_hooks
 
 
 def test_pictures_and_clouds(run):
-    """Pictures and point clouds are logged at every validation, with all points of the body."""
+    """Pictures and point clouds, with all points of the body, are logged at each validation."""
     folder, _ = run
     found = events(folder / "tensorboard")
     steps = [e.step for e in found.Scalars("val/psnr")]
@@ -192,7 +191,7 @@ def test_pictures_and_clouds(run):
 
 
 def test_the_session_says_what_the_run_is_and_that_it_ended(run):
-    """The HParams tab shows a run with its settings, its final number and its success."""
+    """The HParams tab shows a run's settings, final metric and success."""
     folder = run[0] / "tensorboard"
     start = hparams(folder, "_hparams_/session_start_info").session_start_info
     assert start.hparams["ablation"].string_value == "full"
@@ -207,19 +206,19 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
 
 
 def test_logs_resume_where_the_checkpoint_was(tmp_path):
-    """Logs of a resumed run have each step once, also after a kill while writing."""
+    """The logs of a resumed run contain each step once, also after a kill while writing."""
     for logger in (first := loggers(tmp_path)):
         for step in range(10):
             logger.log_metrics({"a": step, **({"b": 1} if step % 2 else {})}, step)
         logger.save()
     with open(tmp_path / "csv" / "metrics.csv", "a") as file:
-        file.write("7")  # killed while it wrote
+        file.write("7")  # killed while writing
     first[0].experiment.close()
-    # TensorBoard reads files of one second in the order of their numbers as text: 10 before 9.
+    # TensorBoard sorts files of the same second by their numbers as text: 10 comes before 9.
     time.sleep(1 - time.time() % 1)
     second = loggers(tmp_path)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # Lightning's that files will be deleted, which is not so
+        warnings.simplefilter("error")  # Lightning's warning that files will be deleted would be wrong
         begin(second, "seed: 1\n", 6)
     for logger in second:
         for step in range(6, 8):
@@ -237,7 +236,7 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
 
 
 def test_a_kill_loses_nothing_that_was_logged(tmp_path):
-    """What came before the checkpoint is not trained, nor logged, again."""
+    """Each value is on disk as soon as it is logged, as steps before the checkpoint are not repeated."""
     csv_log, curves = (
         build({"kind": kind}, f"logger.{kind}", save_dir=str(tmp_path)) for kind in ("csv", "tensorboard")
     )
@@ -250,8 +249,7 @@ def test_a_kill_loses_nothing_that_was_logged(tmp_path):
 
 
 def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
-    """Resumed runs were several there, moved ones too;
-    another run in the same directory is another one."""
+    """Resumed and moved runs keep their W&B id; another run in the same directory gets a new one."""
     seen = []
     monkeypatch.setattr("ghgs_lit.training.loggers.installed", lambda *_: None)
     monkeypatch.setattr("ghgs_lit.training.loggers.WandbLog", lambda **options: seen.append(options["id"]))
@@ -268,7 +266,7 @@ def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
 
 
 def test_runs_of_a_sweep_leave_no_threads(tmp_path):
-    """Each run of a long sweep left the writer of TensorBoard and its memory behind."""
+    """Otherwise each run of a long sweep would leak TensorBoard's writer and its memory."""
     before = threading.active_count()
     for number in range(3):
         of_run = loggers(tmp_path / str(number))
@@ -282,7 +280,7 @@ def test_runs_of_a_sweep_leave_no_threads(tmp_path):
 
 
 def test_hyperparameters_are_choices_and_changes():
-    """Runs are compared by what changes numbers, not by folders or logging."""
+    """Runs are compared by settings that affect results, not by folders or logging."""
     data = {"size": 140, "people": {"train": 3}}
     config = {"seed": 2, "data": data, "optimizer": {"lr": 0.1, "betas": [0, 1]}}
     choices = {
@@ -302,7 +300,7 @@ def test_hyperparameters_are_choices_and_changes():
 
 
 def test_final_numbers_name_their_protocol():
-    """Numbers of different protocols never share a tag."""
+    """Metrics of different protocols never share a tag."""
     summary = [
         {"method": "model", "views": 4, "targets": "release", "subjects": 2, "psnr": 30, "seconds": 1.0},
         {"method": "model", "views": 4, "targets": "midway", "subjects": 2, "psnr": 28, "lpips": None},

@@ -1,4 +1,4 @@
-"""The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
+"""The LightningModule, its schedule, checkpoints and callbacks, with a stand-in model."""
 
 import dataclasses
 from datetime import timedelta
@@ -39,18 +39,18 @@ RELEASE = Optimization(lr=1e-4, warmup=0.01, end_factor=5e-4)
 
 @pytest.mark.parametrize(("step", "rate"), [(0, 4e-6), (2000, 1e-4), (100_000, 5.05e-5), (200_000, 5.0e-8)])
 def test_the_release_schedule_is_the_authors(step, rate):
-    """The learning rates of the published training: first, highest, in the middle, last."""
+    """Learning rates of the published training: initial, highest, half-way, final."""
     assert RELEASE.lr * RELEASE.factor(step / 200_000) == pytest.approx(rate, rel=2e-3)
 
 
 def test_the_schedule_stays_at_its_end():
-    """A budget that is exceeded by one step must not give a negative learning rate."""
+    """A budget exceeded by one step must not give a negative learning rate."""
     assert RELEASE.factor(1.5) == pytest.approx(RELEASE.end_factor)
     assert Optimization(lr=1.0, warmup=0.0, end_factor=0.0).factor(0.0) == 1
 
 
 def test_progress_is_the_further_of_steps_and_time(monkeypatch):
-    """The schedule ends when the first budget ends, whichever kind it is."""
+    """The schedule ends when the budget of steps or of time ends, whichever is first."""
     timer = Timer(duration=timedelta(seconds=100))
     used = {"seconds": 0.0}
     monkeypatch.setattr(timer, "time_elapsed", lambda *_: used["seconds"])
@@ -84,7 +84,7 @@ def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
 
 
 def test_checkpoints_are_plain(tmp_path):
-    """They load with weights_only=True and hold the configuration."""
+    """Checkpoints load with weights_only=True and contain the configuration."""
     last = CheckpointOptions(filename="last", every_n_train_steps=3).build()
     best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     trainer(tmp_path, steps=12, callbacks=[last, best]).fit(module(), loader(), loader(1))
@@ -99,7 +99,7 @@ def test_checkpoints_are_plain(tmp_path):
 
 
 def test_a_scaled_loss_is_unscaled_before_the_gradient_is_clipped(tmp_path):
-    """With 16-mixed the norm that is clipped and logged is that of the loss, not of its multiple."""
+    """With 16-mixed the norm that is clipped and logged is that of the unscaled loss."""
 
     class Norms(L.Callback):
         def on_train_batch_end(self, trainer, *_):
@@ -119,8 +119,8 @@ def test_a_scaled_loss_is_unscaled_before_the_gradient_is_clipped(tmp_path):
 
 
 def test_tf32_is_for_networks_alone():
-    """``trainer.precision=tf32`` lets products round;
-    geometry's do not, and the setting comes back."""
+    """``trainer.precision=tf32`` rounds products of networks but not of geometry, which restores the
+    setting afterwards."""
     matmul = torch.backends.cuda.matmul
     try:
         trainer = TrainerOptions(accelerator="cpu", precision="tf32", max_steps=1).build(logger=False)
@@ -152,14 +152,14 @@ def test_tf32_is_for_networks_alone():
     ],
 )
 def test_impossible_values_name_their_key(values, key):
-    """A value that cannot work fails when it is read, with its key."""
+    """Impossible values fail when they are read, with their key."""
     options = CheckpointOptions if "filename" in values else Optimization
     with pytest.raises(InputError, match=key):
         options(**values)
 
 
 def test_random_numbers_of_a_step_are_those_of_seed_step_and_part(monkeypatch):
-    """Each changes them, and nothing else does: processes draw alike."""
+    """Random numbers depend on these three only, so that all processes sample the same."""
     monkeypatch.setattr(GHGSModule, "global_step", property(lambda self: self._trainer.global_step))
     monkeypatch.setattr(GHGSModule, "global_rank", property(lambda self: self._trainer.global_rank))
 
@@ -176,8 +176,8 @@ def test_random_numbers_of_a_step_are_those_of_seed_step_and_part(monkeypatch):
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
-    """Its checkpoint rebuilds the model and, with the parts that no configuration describes,
-    the module."""
+    """The checkpoint of a custom Trainer is enough to rebuild the model, and the module together with the
+    parts that are not configured."""
     parts = {"losses": losses_of({"render_l1": 1.0}), "optimization": Optimization(lr=1e-3)}
     subject = GHGSModule(make_model(), flat_renderer, **parts)
     batch = make_batch(1, 3, 42, 42)
@@ -209,7 +209,7 @@ def test_the_module_of_a_run_is_read_with_its_parts(tmp_path):
 
 
 def test_validation_measures_clamped_renders(tmp_path):
-    """PSNR and SSIM are of the pictures that are seen, as `ghgs evaluate` measures them."""
+    """PSNR and SSIM are measured on clamped images, as by `ghgs evaluate`."""
 
     def brighter(gaussians, cameras, by=3.0):
         drawn = flat_renderer(gaussians, cameras)
@@ -230,7 +230,7 @@ def test_validation_measures_clamped_renders(tmp_path):
 
 
 def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
-    """Where the model says that a depth is not valid, it has none that could be wrong."""
+    """Pixels whose depth the model marks as invalid are ignored."""
 
     class Half(Standin):
         def forward(self, batch):
@@ -245,8 +245,8 @@ def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
 
 
 def test_rounds_are_measured_as_the_result_is(tmp_path):
-    """Renders of the Gaussians before each round are clamped, too,
-    and depths are those before it."""
+    """Renderings of the Gaussians before each round are clamped, too, and their depths are those before
+    it."""
 
     def brighter(gaussians, cameras):
         drawn = flat_renderer(gaussians, cameras)

@@ -1,4 +1,4 @@
-"""Muon beside PyTorch's own, singular values, and AdamW for what is no matrix."""
+"""Muon compared with PyTorch's, orthogonalisation, and AdamW for parameters that are not matrices."""
 
 from contextlib import nullcontext
 
@@ -18,7 +18,7 @@ OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 
 
 class Small(nn.Module):
-    """A convolution, matrices and what Muon leaves to AdamW."""
+    """A convolution, matrices, and parameters that Muon leaves to AdamW."""
 
     def __init__(self):
         super().__init__()
@@ -33,7 +33,7 @@ class Small(nn.Module):
 
 
 def set_gradients(model, seed):
-    """The same random gradients for equal seeds."""
+    """Set random gradients, equal for equal seeds."""
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         parameter.grad = torch.randn(parameter.shape, generator=generator)
@@ -41,7 +41,8 @@ def set_gradients(model, seed):
 
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_padding_and_company_change_nothing(kind, monkeypatch):
-    """Small ones of all shapes together, as on a CPU and on a GPU, and large ones; float64."""
+    """In float64, matrices of many shapes give the same result together as alone, with the padding of a CPU
+    and of a GPU."""
     if kind == "gpu":
         monkeypatch.setattr(muon, "_power_of_two", lambda count: 128)
     muon._packing.cache_clear()
@@ -65,14 +66,14 @@ def test_padding_and_company_change_nothing(kind, monkeypatch):
 
 
 def test_a_step_launches_few_kernels():
-    """Of the shipped weights: 134 matrices; PyTorch's Muon launches some 1500 for 61 of them."""
+    """For the shipped weights with 134 matrices; PyTorch's Muon launches about 1500 for 61 of them."""
     model = load_model()
     with pretend_device() as log:
         trained = [p for p in model.to(DEVICE).parameters() if p.requires_grad]
         options = Optimization(lr=1e-3, matrix_scale=1.0)
         optimizer = options.optimizer(model)
         hold_rates(optimizer)
-        for _ in range(2):  # the first makes the state
+        for _ in range(2):  # the first creates the state
             for parameter in trained:
                 parameter.grad = torch.ones_like(parameter)
             log.clear()
@@ -83,8 +84,8 @@ def test_a_step_launches_few_kernels():
 
 
 def test_what_counts_as_a_matrix():
-    """Convolutions and linear layers from 3 rows and columns on;
-    no tokens, biases, heads of two channels."""
+    """Convolutions and linear layers with at least 3 rows and columns are matrices; tokens, biases and
+    heads with two channels are not."""
     found = [name for name, parameter in Small().named_parameters() if is_matrix(parameter)]
     assert found == ["conv", "square", "tall", "wide"]
     shapes = [(3, 3), (3, 1, 3), (2, 9), (9, 2), (9,), ()]
@@ -92,7 +93,8 @@ def test_what_counts_as_a_matrix():
 
 
 def test_neither_scale_nor_company_matters():
-    """Zeros stay zeros; one whose squares underflow beside ordinary ones, a tall one and a longer one."""
+    """The result depends neither on scales, even if squares underflow, nor on the other matrices; zeros stay
+    zeros."""
     generator = torch.Generator().manual_seed(4)
     several = [torch.randn(shape, generator=generator) for shape in ((16, 20), (16, 20), (20, 16), (16, 99))]
     alone = [orthogonalized([matrix])[0] for matrix in several]
@@ -102,7 +104,7 @@ def test_neither_scale_nor_company_matters():
 
 
 def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
-    """A recorded step reads the same tensor again; files stay as they were."""
+    """Learning rates stay the same tensors, which captured steps read, and checkpoints contain numbers."""
     with pretend_device():
         model = Small().to(DEVICE)
         optimizer = Optimization(lr=0.01, matrix_scale=2.0).optimizer(model)
@@ -126,9 +128,9 @@ def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
 
 
 def test_matrices_move_as_with_pytorchs_muon():
-    """PyTorch's Muon iterates in bfloat16: equal up to its rounding over five steps."""
+    """Steps equal those of PyTorch's Muon, up to the rounding of its bfloat16 iterations over five steps."""
     ours, theirs = Small(), Small()
-    flat = nn.Parameter(theirs.conv.detach().flatten(1))  # a row for each output channel
+    flat = nn.Parameter(theirs.conv.detach().flatten(1))  # one row per output channel
     matrices = [theirs.square, theirs.tall, theirs.wide, flat]
     optimizer = Muon(ours.parameters(), matrix_lr=0.02, **OPTIONS)
     reference = torch.optim.Muon(
@@ -147,7 +149,7 @@ def test_matrices_move_as_with_pytorchs_muon():
 
 
 def test_everything_else_moves_as_with_adamw():
-    """Bit for bit, and no parameter is left out or moved twice."""
+    """Steps equal AdamW's bit for bit, and no parameter is missed or updated twice."""
     ours, theirs = Small(), Small()
     optimizer = Muon(ours.parameters(), matrix_lr=0.02, **OPTIONS)
     adamw = torch.optim.AdamW(theirs.parameters(), **OPTIONS)
@@ -163,7 +165,7 @@ def test_everything_else_moves_as_with_adamw():
 
 
 def test_parameters_without_gradient_stay():
-    """Those that are frozen for a while (`optimizer.freeze_until`), without weight decay."""
+    """Frozen parameters (`optimizer.freeze_until`) are not even changed by weight decay."""
     model = Small()
     before = {name: p.detach().clone() for name, p in model.named_parameters()}
     optimizer = Muon(model.parameters(), matrix_lr=0.02, **OPTIONS)
@@ -175,7 +177,7 @@ def test_parameters_without_gradient_stay():
 
 
 def stepped(backend, capturable=True, steps=5):
-    """Weights after some steps on the pretend device, whose rates follow a schedule, and counts."""
+    """Take steps with a schedule on the pretend device; returns the weights, and counts of captures."""
     model = Small().to(DEVICE)
     model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
     optimizer = Muon(model.parameters(), matrix_lr=0.02, capturable=capturable, **OPTIONS)
@@ -198,8 +200,8 @@ MATRICES = {"conv", "square", "tall", "wide"}
 
 @pytest.mark.parametrize("capturable", [True, False])
 def test_steps_that_are_played_back_are_the_same(capturable):
-    """Recording takes no step by itself, and neither does a try that fails: AdamW counts on the
-    host. The first step makes the state. Weights of a convolution in another layout, too."""
+    """Replayed steps equal eager ones, also for channels-last weights; neither a capture nor a failed
+    attempt (AdamW that counts steps on the host) takes an extra step."""
     with pretend_device():
         wanted, _ = stepped(None, capturable)
         with nullcontext() if capturable else pytest.warns(UserWarning, match="not captured as a CUDA graph"):

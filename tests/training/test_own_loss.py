@@ -1,5 +1,5 @@
-"""A loss with weights of its own, from a file outside of the package:
-nothing of a training forgets them."""
+"""A loss with trained weights from a plug-in: training, clipping, freezing, averaging and checkpoints all
+include its weights."""
 
 import shutil
 import sys
@@ -27,9 +27,9 @@ TRAINED = {"losses.log_variance", "losses.mixing"}
 
 @pytest.fixture(autouse=True)
 def plugin(tmp_path, monkeypatch):
-    """The user's file is known, as with GHGS_PLUGINS in a shell."""
+    """Register the user's file, as GHGS_PLUGINS does in a shell."""
     shutil.copy(FILE, tmp_path / "own_loss.py")
-    registry.load_plugins()  # those of the distribution stay registered
+    registry.load_plugins()  # the distribution's plug-ins stay registered
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
     monkeypatch.setenv(registry.VARIABLE, str(tmp_path / "own_loss.py"))
@@ -39,7 +39,7 @@ def plugin(tmp_path, monkeypatch):
 
 
 def module(model=None, settings=None, **options) -> GHGSModule:
-    """A training with the user's loss; equal each time."""
+    """A module with the user's loss and equal initial weights at each call."""
     torch.manual_seed(0)
     options = {"lr": 0.05, "warmup": 0.0, "weight_decay": 0.0, **options}
     losses = build(NODE, "loss")
@@ -59,7 +59,7 @@ def weights(subject) -> dict[str, torch.Tensor]:
 
 
 class Seen(L.Callback):
-    """Weights after each step, and the norm of the gradient that the optimizer gets."""
+    """Records the weights after each step, and the norm of the gradient that the optimizer gets."""
 
     def __init__(self):
         self.weights, self.norms = [], []
@@ -74,7 +74,7 @@ class Seen(L.Callback):
 
 
 class Save(L.Callback):
-    """A checkpoint in the middle of a run."""
+    """Saves a checkpoint in the middle of a run."""
 
     def __init__(self, path, step):
         self.path, self.step = path, step
@@ -86,7 +86,7 @@ class Save(L.Callback):
 
 @pytest.mark.parametrize("scale", [None, 1.0])
 def test_its_weights_move_in_each_step(tmp_path, scale):
-    """With AdamW and Muon; what is frozen stays."""
+    """AdamW and Muon train the loss's weights, except frozen ones."""
     subject, seen = module(matrix_scale=scale), Seen()
     before = weights(subject)
     trainer(tmp_path, 3, seen).fit(subject, StepData())
@@ -97,15 +97,15 @@ def test_its_weights_move_in_each_step(tmp_path, scale):
 
 
 def test_the_norm_that_is_clipped_is_that_of_all_weights(tmp_path):
-    """Gradients of model and loss together are at most as long as ``optimizer.clip``."""
+    """The joint norm of the gradients of model and loss is at most ``optimizer.clip``."""
     subject, seen = module(clip=1e-3), Seen()
     trainer(tmp_path, 2, seen).fit(subject, StepData())
     assert seen.norms[-1] == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_its_weights_can_be_frozen_for_a_share_of_the_run(tmp_path):
-    """By their names in the checkpoint; those of the model keep the names that they have in it. Neither
-    gradient nor weight decay moves them; an unknown prefix is an error."""
+    """Prefixes are names in the checkpoint, for the model names within it; neither gradients nor weight
+    decay change frozen weights, and an unknown prefix raises."""
     until = {"losses.mixing": 0.5, "shift": 0.5}
     subject, seen = module(freeze_until=until, weight_decay=0.1), Seen()
     before = weights(subject)
@@ -117,8 +117,8 @@ def test_its_weights_can_be_frozen_for_a_share_of_the_run(tmp_path):
 
 
 def test_a_run_goes_on_with_them(tmp_path):
-    """Weights and the optimizer's averages, bit for bit;
-    a loss without such weights is refused by name."""
+    """A resumed run continues with equal weights and averages of the optimizer, bit for bit; a loss without
+    these weights is rejected by name."""
     path, whole, seen = tmp_path / "last.ckpt", module(matrix_scale=1.0), Seen()
     trainer(tmp_path, 6, Save(path, 3), seen).fit(whole, StepData())
     again = module(matrix_scale=1.0)
@@ -134,8 +134,7 @@ def test_a_run_goes_on_with_them(tmp_path):
 
 
 def test_the_average_is_of_all_weights(tmp_path):
-    """Lightning's, beside one that is computed here;
-    a run that goes on has both it and the weights."""
+    """Lightning's average of model and loss equals one computed here."""
     subject, seen = module(), Seen()
     run = trainer(tmp_path, 4, AveragingOptions(decay=0.75).build(), seen)
     run.fit(subject, StepData())
@@ -148,7 +147,7 @@ def test_the_average_is_of_all_weights(tmp_path):
 
 
 def test_a_run_with_an_average_goes_on(tmp_path):
-    """From a checkpoint in the middle, bit for bit."""
+    """A run resumed in the middle ends with an equal average, bit for bit."""
 
     middle = tmp_path / "two.ckpt"
     results = []
@@ -164,8 +163,8 @@ def test_a_run_with_an_average_goes_on(tmp_path):
 
 
 def test_a_checkpoint_brings_the_loss_and_does_without_it(tmp_path, monkeypatch):
-    """The whole module is read with its weights,
-    and the model alone where nobody knows the loss."""
+    """A checkpoint restores the module with the loss's weights, and the model alone if the loss is not
+    registered."""
     settings = {**config(), "loss": NODE}
     subject = module(make_model(), settings)
     subject.losses.mixing.data.add_(1)
@@ -184,7 +183,7 @@ def test_a_checkpoint_brings_the_loss_and_does_without_it(tmp_path, monkeypatch)
 
 
 def test_terms_join_by_registration(tmp_path):
-    """A function and a class: both are trained for, next to a term of the package, and logged."""
+    """Registered terms, a function and a class, are minimised and logged together with built-in ones."""
     weights = {"edges": 0.5, "light": 2.0, "render_l1": 0.8, "render_ssim": 0.0, "chamfer": 0.0}
     losses = run_of("train", [f"loss.weights.{name}={value}" for name, value in weights.items()]).loss.build()
     subject = GHGSModule(Standin(), flat_renderer, losses, Optimization(lr=0.05))

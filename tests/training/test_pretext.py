@@ -1,4 +1,4 @@
-"""The pretext stage: labels of patches against loops over pixels, loss and measure, and its command."""
+"""Pretext training: labels of patches compared with loops over pixels, loss and metric, and its command."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ def kept_of(batch):
 
 
 def test_parts_lie_where_a_person_has_them():
-    """The rig's left is +x; a swap of sides or a bone of another part would teach it."""
+    """Sides must not be swapped (the rig's left is +x), nor bones be assigned to wrong parts."""
     points = load_body().mean[:BODY_VERTICES]
     names = np.array(PARTS)[vertex_parts()]
     assert set(names) == set(PARTS)
@@ -56,7 +56,7 @@ def test_parts_lie_where_a_person_has_them():
 
 
 def test_a_point_has_the_part_of_the_nearest_vertex():
-    """Against all distances; bodies of another kind have other vertices."""
+    """Parts equal those from all distances; a body with another number of vertices is rejected."""
     vertices = torch.from_numpy(load_body().mean[:BODY_VERTICES])
     g = torch.Generator().manual_seed(0)
     points = vertices[torch.randint(BODY_VERTICES, (50,), generator=g)] + 0.05 * torch.randn(
@@ -71,7 +71,7 @@ def test_a_point_has_the_part_of_the_nearest_vertex():
 
 
 def test_shares_are_those_of_a_patchs_pixels():
-    """Each pixel of the scene shows a known vertex."""
+    """Shares equal those counted from the vertex that each pixel shows."""
     batch, shown = scene(2, 2, 84, 70)
     kept = kept_of(batch)
     shares = part_shares(batch, SIZE)[kept.index]
@@ -85,8 +85,7 @@ def test_shares_are_those_of_a_patchs_pixels():
     everywhere = torch.zeros(2 * 2 * 6 * 5, dtype=torch.bool)
     everywhere[kept.index] = True
     assert torch.equal(part_shares(batch, SIZE).any(1), everywhere)
-    # A vertex is not exactly at its pixel's centre,
-    # so that another one may be nearer at a border of parts.
+    # A vertex is not exactly at its pixel's centre, so at a border of parts another one may be nearer.
     assert (shares - expected).abs().sum(1).mean() < 0.05
 
 
@@ -94,14 +93,15 @@ def test_shares_are_those_of_a_patchs_pixels():
     ("missing", "message"), [("depths", "data: expected true depths"), ("body_vertices", "data: ")]
 )
 def test_photographs_without_labels_are_refused(missing, message):
-    """Photographs of real people say nothing about parts."""
+    """Images of real people have no labels of parts."""
     batch, _ = scene(2, 2, 84, 70)
     with pytest.raises(InputError, match=message):
         part_shares(dataclasses.replace(batch, **{missing: None}), SIZE)
 
 
 def test_the_nearest_neighbour_of_another_view_is_asked():
-    """Against a loop over pairs with PyTorch's cosine; lengths of features do not count."""
+    """The result equals a loop over pairs with PyTorch's cosine similarity, whatever the lengths of
+    features."""
     g = torch.Generator().manual_seed(0)
     features = torch.randn(40, 6, generator=g) * torch.logspace(-3, 3, 40)[:, None]
     parts, views = torch.randint(4, (40,), generator=g), torch.randint(3, (40,), generator=g)
@@ -116,14 +116,14 @@ def test_the_nearest_neighbour_of_another_view_is_asked():
 
 
 def test_without_another_view_nothing_is_right():
-    """One view alone, and no patch at all, are defined."""
+    """A single view and an empty set of patches have defined results."""
     one = torch.zeros(3, dtype=torch.long)
     assert not neighbor_shows_part(torch.ones(3, 2), one, one).any()
     assert neighbor_shows_part(torch.ones(0, 2), one[:0], one[:0]).shape == (0,)
 
 
 def test_patches_without_a_part_do_not_count():
-    """Against PyTorch's cross-entropy of the others; none at all is a loss of 0."""
+    """The loss equals PyTorch's cross-entropy of the other patches; without any it is 0."""
     g = torch.Generator().manual_seed(0)
     logits, shares = torch.randn(10, 5, generator=g), torch.rand(10, 5, generator=g)
     shares /= shares.sum(1, keepdim=True)
@@ -135,11 +135,11 @@ def test_patches_without_a_part_do_not_count():
 
 
 def test_a_branch_learns_a_scene():
-    """The loss must reach every parameter of the branch and fall."""
+    """The loss has a gradient for every parameter of the branch, and decreases."""
     batch, _ = body_batch(1, 2, 56, 42)
     torch.manual_seed(0)
     branch = SemanticOptions(width=32, depth=1, heads=2, channels=8).build(14)
-    assert branch.parts == len(PARTS)  # another number would count some parts as others
+    assert branch.parts == len(PARTS)  # with another number, parts would be confused
     model = Pretext(branch)
     optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
     losses = []
@@ -161,7 +161,7 @@ TINY += ["evaluation.targets=[release]", "trainer.limit_val_batches=0"]
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Boxes that are said to be built-in people: what the labels say does not matter here."""
+    """Boxes with the vertices of built-in people; their labels do not matter here."""
     folder = tmp_path_factory.mktemp("bodies")
     render_boxes(folder / "rendered", folder / "scans", train=2, val=1)
     vertices = load_body().mean[:BODY_VERTICES].astype(np.float32)
@@ -172,7 +172,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pretrained(data, tmp_path_factory):
-    """A run of four steps."""
+    """Directory of a pretext run of four steps."""
     directory = tmp_path_factory.mktemp("pretext") / "run"
     steps = ["trainer.max_steps=4", "trainer.val_check_interval=2"]
     assert ghgs("pretext", *data, BRANCH, *steps, f"hydra.run.dir={directory}") == 0
@@ -184,7 +184,8 @@ def read(path):
 
 
 def test_the_checkpoint_holds_the_branch_and_its_configuration(pretrained):
-    """Models load it by the names of their own tensors; tables read where its features are from."""
+    """Names of tensors are those of full models, and the configuration contains the origin of the features
+    for tables."""
     checkpoint = read(pretrained / "checkpoints" / "last.ckpt")
     beginnings = {".".join(name.split(".")[:3]) for name in checkpoint["state_dict"]}
     assert beginnings == {"model.encoder.semantic"}
@@ -196,8 +197,7 @@ def test_the_checkpoint_holds_the_branch_and_its_configuration(pretrained):
 
 
 def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_path):
-    """After training the branch is still that of the pretext stage,
-    and counts as one that holds parts."""
+    """Training leaves the pretrained branch unchanged, and tables list it as semantic."""
     source = pretrained / "checkpoints" / "last.ckpt"
     options = [
         *data,
@@ -234,7 +234,7 @@ def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_pat
     ],
 )
 def test_what_cannot_work_is_refused_in_one_line(data, tmp_path, capsys, overrides, message):
-    """A wrong setting must be named."""
+    """The error names the wrong setting."""
     steps = ["trainer.max_steps=1", "logger=none", "callbacks=none"]
     assert ghgs("pretext", *data, *steps, *overrides, f"hydra.run.dir={tmp_path}") == 1
     assert message in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""How far a run is: lines, a bar on a terminal."""
+"""Progress of a run: lines, or a bar on a terminal."""
 
 import dataclasses
 import re
@@ -19,8 +19,8 @@ from tests.helpers.training import loader, module, trainer
 
 
 def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
-    """A log of a batch job shows step, loss, steps a second, time left and validation,
-    as does train.log."""
+    """The log of a batch job and train.log show the step, loss, steps per second, remaining time and
+    validation."""
     monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     lines = (tmp_path / "train.log").read_text().splitlines()
@@ -33,7 +33,7 @@ def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("width", [80, 160])
 def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
-    """On a terminal there are no lines beside it; the log has them. A narrow one wraps the text."""
+    """A terminal shows the bar, wrapped if narrow, and train.log gets the lines."""
     monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
     monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
     monkeypatch.setattr("rich.console.Console.size", ConsoleDimensions(width, 25))
@@ -44,8 +44,8 @@ def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
 
 
 def test_the_first_step_says_whom_tokens_attend_to(tmp_path, capsys):
-    """With more neighbours than tokens the other setting has the same:
-    the ablation would compare nothing."""
+    """With more neighbours than tokens both settings share all neighbours, so that the ablation would
+    compare nothing."""
     batch = make_batch(1, 3)
     own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1])
     batches = DataLoader(
@@ -62,7 +62,7 @@ def test_the_first_step_says_whom_tokens_attend_to(tmp_path, capsys):
 
 
 def test_the_lines_come_once_a_minute(monkeypatch):
-    """A log of days has thousands of lines, not millions."""
+    """The log of a run of days has thousands of lines, not millions."""
     now = iter([0.0, 0.0, 30.0, 60.0, 90.0, 125.0])
     monkeypatch.setattr("ghgs_lit.runs.progress.time.monotonic", lambda: next(now))
     lines = Lines()
@@ -70,7 +70,7 @@ def test_the_lines_come_once_a_minute(monkeypatch):
 
 
 def test_evaluation_says_how_far_it_is(capsys):
-    """Without a terminal a long evaluation prints lines as well."""
+    """A long evaluation without a terminal prints lines, too."""
     assert list(track([1, 2, 3], "measuring", every=0.0)) == [1, 2, 3]
     assert [line.split(" ", 1)[1] for line in capsys.readouterr().out.splitlines()] == [
         "measuring: 1 of 3, 0:00:00",

@@ -1,5 +1,4 @@
-"""An interrupted run resumes to the same weights, logs and best checkpoint;
-its files stay complete."""
+"""An interrupted run resumes to the same weights, logs and best checkpoint, with complete files."""
 
 import csv
 import shutil
@@ -32,7 +31,7 @@ class PowerCut(Exception):
 
 
 class Cut(L.Callback):
-    """Ends the run after step ``at`` or in the validation after it; counts validations."""
+    """Aborts the run after step ``at`` or in the validation after it, and records validations."""
 
     def __init__(self, at: int | None = None, validating: bool = False):
         self.at, self.validating, self.validations = at, validating, []
@@ -49,14 +48,14 @@ class Cut(L.Callback):
 
 
 def module() -> GHGSModule:
-    # Frozen parameters and points drawn at random: both must know where the run stands.
+    # Frozen parameters and randomly sampled points: both depend on the step of the run.
     losses = losses_of({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
     optimization = Optimization(lr=0.05, warmup=0.1, end_factor=0.0, freeze_until={"shift": 0.4})
     return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
 
 def fit(folder, cut: Cut, resume=None, every=3, more=(), subject=None, **options):
-    torch.manual_seed(11 if resume else 12)  # what the process drew before must not matter
+    torch.manual_seed(11 if resume else 12)  # the state of the global generator must not matter
     best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     last = CheckpointOptions(filename="last", every_n_train_steps=every).build()
     trainer = L.Trainer(
@@ -76,7 +75,7 @@ def fit(folder, cut: Cut, resume=None, every=3, more=(), subject=None, **options
 
 
 def killed(folder, cut: Cut, **options):
-    """The last checkpoint of a run that is cut, and its step."""
+    """Train until the cut; returns the last checkpoint and its step."""
     with pytest.raises(PowerCut):
         fit(folder, cut, **options)
     last = folder / "checkpoints" / "last.ckpt"
@@ -95,7 +94,7 @@ def score(folder) -> tuple[float, int]:
 
 
 def test_the_best_checkpoint_has_the_highest_psnr(whole):
-    """Of the four validations, whose values differ."""
+    """The best checkpoint is that of the highest of four different values."""
     folder, _, validations = whole(1)
     found = [float(row["val/psnr"]) for row in rows(folder) if "val/psnr" in row]
     assert len(set(found)) == len(validations)
@@ -117,18 +116,18 @@ def test_the_best_checkpoint_has_the_highest_psnr(whole):
     ],
 )
 def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating, every, accumulate, saved):
-    """Cut within an epoch of 5, at a validation (every 4), within one. A checkpoint that is due at a
-    validation comes after it: a restart does not repeat it. None is written between two batches of one
-    step, where gradients would be lost."""
+    """Cuts within an epoch of 5 steps, and at or within a validation (every 4 steps). A checkpoint that is
+    due at a validation is written after it, as a restart does not repeat it, and none is written between
+    two batches of a step, where gradients would be lost."""
     first, options = Cut(at, validating), {"every": every, "accumulate_grad_batches": accumulate}
     last, step = killed(tmp_path, first, **options)
-    assert step == saved  # the cut comes before what is due at its own step
+    assert step == saved  # the cut precedes a checkpoint that is due at the same step
     second = Cut()
     subject = fit(tmp_path, second, resume=last, **options)
     folder, expected, validations = whole(accumulate)
     for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
         assert torch.equal(a, b)
-    if accumulate == 1:  # else validations of batches fall between steps
+    if accumulate == 1:  # otherwise validations, counted in batches, fall between steps
         assert [s for s in first.validations if s <= step] + second.validations == validations
         assert score(tmp_path) == score(folder)
         assert rows(tmp_path) == rows(folder)
@@ -136,25 +135,25 @@ def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating, e
 
 @pytest.mark.parametrize(("accumulate", "cut"), [(2, None), (2, 4), (2, 5), (3, 3), (1, 7)])
 def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumulate, cut):
-    """No batch is skipped at the end of an epoch that is no multiple of the batches of a step."""
+    """No batch is skipped at the end of an epoch whose length is no multiple of the batches of a step."""
     drawn = []
     real = _Steps.__getitem__
     monkeypatch.setattr(_Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1])
     in_epoch, last = -(-5 // accumulate), None
     if cut is not None:
-        # The checkpoint of the step before the cut: that step's batches come again.
+        # The checkpoint is from the step before the cut, so the batches of the cut step repeat.
         last, steps = killed(tmp_path, Cut(cut), every=1, accumulate_grad_batches=accumulate)
         del drawn[steps // in_epoch * 5 + steps % in_epoch * accumulate :]
     fit(tmp_path, Cut(), resume=last, accumulate_grad_batches=accumulate)
-    # 16 steps: full epochs of 5 batches, then what is left.
+    # 16 steps: full epochs of 5 batches, then the rest.
     epochs, rest = divmod(STEPS, in_epoch)
     assert drawn[: 5 * epochs + rest * accumulate] == list(range(5 * epochs + rest * accumulate))
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monkeypatch, elsewhere):
-    """Killed and resumed, also in another folder when the first is gone:
-    weights as of a run in one piece."""
+    """A killed run resumes to the weights of an uninterrupted one, also in another folder after the first
+    is deleted."""
 
     def half_frozen():
         subject = module()
@@ -181,7 +180,7 @@ def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monke
 
 
 def test_a_finished_run_that_is_trained_on_counts_on(tmp_path, monkeypatch):
-    """Steps 5 to 8 stood as 6 to 9 in the logs."""
+    """Steps 5 to 8 must not be logged as 6 to 9."""
     monkeypatch.setattr("tests.training.test_resume.STEPS", 4)  # with a validation at its end
     subject = fit(tmp_path, Cut())
     last = tmp_path / "checkpoints" / "last.ckpt"
@@ -194,7 +193,7 @@ def test_a_finished_run_that_is_trained_on_counts_on(tmp_path, monkeypatch):
 
 
 def test_time_that_was_used_stays_used(tmp_path):
-    """With a budget of time the learning rate continues where it was."""
+    """With a budget of time, the learning rate continues where the checkpoint left off."""
     seen = []
 
     class Look(Cut):
@@ -204,7 +203,7 @@ def test_time_that_was_used_stays_used(tmp_path):
         def on_train_batch_end(self, trainer, pl_module, *_):
             timer = next(c for c in trainer.callbacks if type(c).__name__ == "Timer")
             if self.at:
-                timer._offset += 200  # as if each step took this many seconds
+                timer._offset += 200  # as if each step took 200 seconds
             super().on_train_batch_end(trainer, pl_module)
 
     options = {"max_time": {"seconds": 1000}}
@@ -216,8 +215,7 @@ def test_time_that_was_used_stays_used(tmp_path):
 
 
 def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
-    """Resuming needs the same model and the state of the optimizer;
-    changed settings are reported."""
+    """Resuming requires the same model and the state of the optimizer; changed settings are reported."""
 
     class Other(Standin):
         def __init__(self):
@@ -244,7 +242,7 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
 
 
 def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
-    """From the first resumed step on, the rate is what the schedule has of the new one."""
+    """From the first resumed step on, the schedule applies to the new learning rate."""
     last, _ = killed(tmp_path, Cut(8))
     changed = module()
     changed.optimization = Optimization(
@@ -264,7 +262,7 @@ def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("old", "new"), [(None, 2.5), (2.5, None)])
 def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
-    """Muon cannot go on from the averages of AdamW, nor AdamW from Muon's."""
+    """Muon cannot continue from AdamW's averages, nor AdamW from Muon's."""
     before, now = (Optimization(lr=0.05, matrix_scale=scale) for scale in (old, new))
     subject = held(Standin(), now)
     subject._trainer = SimpleNamespace(ckpt_path=tmp_path / "a.ckpt")
@@ -272,7 +270,7 @@ def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
         subject.on_load_checkpoint({"optimizer_states": [before.optimizer(Standin()).state_dict()]})
 
 
-#: Places in a checkpoint, and what damages it there; None: they are deleted.
+#: Places in a checkpoint, and the values that damage them; None: deleted.
 DAMAGED = [
     ("optimizer_states/0/param_groups/0/params", [0]),
     ("optimizer_states/0/param_groups", 3),
@@ -304,8 +302,8 @@ def test_a_damaged_state_of_training_is_one_line(whole, tmp_path, place, value):
 
 
 def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
-    """Broken averages of the gradient would be trained on in silence:
-    the file has checksums of all."""
+    """Damaged averages of the gradient would otherwise go unnoticed; the file has checksums of all
+    tensors."""
     path = tmp_path / "checkpoints" / "last.ckpt"
     fit(tmp_path, Cut())
     step, _ = check_resume(path, held(Standin()), CONFIG)
@@ -319,15 +317,14 @@ def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
 
 
 def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
-    """Seconds and peak memory of a resumed run are those of the whole training,
-    not of its last session."""
+    """Seconds and peak memory of a resumed run are those of all its sessions."""
     first, second = TrainingCost(), TrainingCost()
     last, _ = killed(tmp_path, Cut(13), more=[first])
     saved = next(v for k, v in torch.load(last, weights_only=True)["callbacks"].items() if "Cost" in k)
     earlier = saved["time_elapsed"]["train"]
     assert 0 < earlier < first.seconds
     assert saved["peak_bytes"] > 2**20
-    second.on_train_start = lambda *_: None  # a session of no time
+    second.on_train_start = lambda *_: None  # a session whose timer never starts
     fit(tmp_path, Cut(), resume=last, more=[second])
     assert second.seconds == earlier
     third = TrainingCost()
@@ -337,7 +334,7 @@ def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
 
 
 def test_one_way_to_start(tmp_path):
-    """init_from beside resume is ambiguous, except for a run that began with init_from."""
+    """init_from together with resume is ambiguous, except for a run that began with init_from."""
     both = run_of("train", ["resume=elsewhere/last.ckpt", "init_from=a.ckpt"])
     with pytest.raises(InputError, match="init_from"):
         check_start(both, tmp_path)
@@ -349,8 +346,7 @@ def test_one_way_to_start(tmp_path):
     ("minutes", "steps", "saved"), [(1e-6, 1000, STEPS), (1000, 5, 15), (1000, 1000, None)]
 )
 def test_minutes_and_steps_both_count(tmp_path, minutes, steps, saved):
-    """Slow steps are saved by the clock, fast ones by their number;
-    Lightning's own class refuses both."""
+    """Checkpoints are saved by time and by steps, a combination that Lightning's class rejects."""
     by_both = CheckpointOptions(filename="both", minutes=minutes, every_n_train_steps=steps).build()
     fit(tmp_path, Cut(), every=1000, more=[by_both])
     path = tmp_path / "checkpoints" / "both.ckpt"

@@ -1,4 +1,4 @@
-"""Jobs of SLURM: their processes, and that they go on when they are queued again."""
+"""SLURM jobs: their processes, and their continuation after they are requeued."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ BATCH = {
 
 
 def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
-    """``#SBATCH --ntasks=4`` asks for cores; only ``srun`` starts as many processes."""
+    """``#SBATCH --ntasks=4`` only allocates cores; only ``srun`` starts that many processes."""
     run = run_of("train", ["trainer=cpu", "logger=none", "callbacks=none"])
     for name, value in BATCH.items():
         monkeypatch.setenv(name, value)
@@ -45,8 +45,8 @@ def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
 
 @pytest.fixture
 def task(monkeypatch, tmp_path):
-    """The environment of ``srun``, in a new working directory;
-    the file that requests to SLURM go to."""
+    """Set the environment of ``srun`` and a new working directory; returns the file to which requests to
+    SLURM are written."""
     for name, value in (BATCH | {"SLURM_NTASKS": "1", "SLURM_STEP_ID": "0"}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("SLURM_RESTART_COUNT", raising=False)
@@ -71,8 +71,8 @@ def stopped_by(number):
 @pytest.mark.parametrize("places", [("seed=3",), ("-m", "seed=3,4"), ("seed=3", "hydra.run.dir=mine")])
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, number):
-    """The same command began anew in another directory, or was refused. A job that ends early is
-    queued again by SLURM, one whose time is up (SIGUSR1) on request."""
+    """The same command resumes in its directory, instead of starting anew or being rejected. SLURM requeues
+    a job that is ended early by itself, and one whose time is up (SIGUSR1) on request."""
     monkeypatch.setattr(train_verb, "train", stopped_by(number))
     code, _, err = call(monkeypatch, capsys, "train", *places)
     assert code == 128 + number
@@ -90,7 +90,7 @@ def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, n
 
 
 def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
-    """A second command of an interactive job is a run of its own."""
+    """A second command in an interactive job is a new run."""
     monkeypatch.setattr(train_verb, "train", stopped_by(signal.SIGTERM))
     assert call(monkeypatch, capsys, "train", "hydra.run.dir=runs/train/1")[0] == 143
     monkeypatch.setattr(train_verb, "train", record_execution)
@@ -104,8 +104,8 @@ def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
 
 
 def test_only_tasks_of_srun_are_queued_again(monkeypatch, task):
-    """A batch script without ``srun`` is stopped, with a checkpoint;
-    jobs of arrays have two numbers."""
+    """A batch script without ``srun`` is not requeued; jobs of arrays are requeued by both of their
+    numbers."""
     monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "1230")
     monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "4")
     assert processes.queue_again(signal.SIGUSR1)
@@ -122,8 +122,7 @@ def test_only_tasks_of_srun_are_queued_again(monkeypatch, task):
 
 
 def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, tmp_path):
-    """The others read whether the first resumes;
-    they wait for it, and not for one of an earlier start."""
+    """The other processes wait for the first one of the same start, and resume if it does."""
     from ghgs_lit.runs import job
 
     monkeypatch.setattr(job, "_PATIENCE", 0.3)

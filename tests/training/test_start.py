@@ -1,4 +1,4 @@
-"""Training that starts from the weights of another run."""
+"""Start of a training from the weights of another run."""
 
 import pytest
 import torch
@@ -11,8 +11,8 @@ from tests.helpers.training import Standin
 
 
 class Other(torch.nn.Module):
-    """Shares ``depth`` with the stand-in; ``shift`` has another shape, ``more`` is new,
-    ``bias`` is not."""
+    """Shares ``depth`` with the stand-in; ``shift`` has another shape, ``more`` is additional, ``bias`` is
+    missing."""
 
     def __init__(self):
         super().__init__()
@@ -29,8 +29,7 @@ def checkpoint(path, model, **changes):
 
 
 def test_each_tensor_has_its_line(tmp_path):
-    """Tensors that do not fit stay as initialised and are reported:
-    a partial load is never silent."""
+    """Tensors that do not fit stay as initialised, and each is reported."""
     path, model = checkpoint(tmp_path / "a.ckpt", Other()), Standin()
     model.bias = torch.nn.Parameter(torch.full((2,), 5.0))
     lines = initialize(model, path)
@@ -51,7 +50,7 @@ def test_each_tensor_has_its_line(tmp_path):
 
 
 def test_strict_takes_all_or_nothing(tmp_path):
-    """A refused checkpoint changes no tensor of the model."""
+    """A rejected checkpoint changes no tensor of the model."""
     model = Standin()
     with pytest.raises(InputError, match=r"a\.ckpt: shift.*\(3,\).*\(4,\)|a\.ckpt: more"):
         initialize(model, checkpoint(tmp_path / "a.ckpt", Other()), strict=True)
@@ -65,8 +64,7 @@ def test_strict_takes_all_or_nothing(tmp_path):
 
 
 def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
-    """Weights of something else, or a mistyped path,
-    must not start a training from scratch unnoticed."""
+    """Weights of another model, or a mistyped path, must not start a training from scratch unnoticed."""
     path = checkpoint(tmp_path / "a.ckpt", torch.nn.Linear(2, 2))
     with pytest.raises(InputError, match=r"init_from.*a\.ckpt"):
         initialize(Standin(), path)
@@ -75,8 +73,8 @@ def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
 
 
 def test_what_does_not_learn_needs_weights(tmp_path):
-    """A checkpoint of another encoder would leave the frozen one random,
-    with a line that nobody reads."""
+    """A checkpoint of another encoder would leave the frozen encoder random, with a report that is easily
+    overlooked."""
     path = checkpoint(tmp_path / "a.ckpt", Other())
     model = Standin()
     model.shift.requires_grad_(False)
@@ -88,8 +86,8 @@ def test_what_does_not_learn_needs_weights(tmp_path):
 
 
 def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
-    """A checkpoint of somebody else must not make folders or processes here;
-    the command line may."""
+    """Settings of folders and processes are taken from the command line, never from a checkpoint, which may
+    come from another machine."""
     machine = {"cache_dir": str(tmp_path / "theirs"), "workers": 1024, "cache_images_mb": 1e9}
     data = {"name": "synthetic", "size": 56}
     path = checkpoint(
@@ -101,7 +99,7 @@ def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
 
 
 def test_a_long_report_ends(tmp_path):
-    """A model of a thousand tensors must not flood the terminal; the file has all lines."""
+    """A model with a thousand tensors must not flood the terminal; the file contains all lines."""
     lines = [f"missing      layer.{n} (3,): left as initialised" for n in range(50)]
     text = report(lines, "a.ckpt", tmp_path / "all.txt")
     assert text.splitlines()[-1] == "... and 30 more"
@@ -110,7 +108,7 @@ def test_a_long_report_ends(tmp_path):
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
 def test_weights_that_are_not_finite_are_refused(tmp_path, wrong):
-    """Every prediction would be empty; no tensor of the model is changed."""
+    """Such weights would make every prediction empty; no tensor of the model is changed."""
     other, model = Standin(), Standin()
     with torch.no_grad():
         other.shift[1] = wrong

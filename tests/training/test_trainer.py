@@ -1,5 +1,5 @@
-"""Habits of Lightning's users act: few batches or steps, equal batches, profiles, strategies,
-precisions; and a seed gives the same curve in every bit."""
+"""Common options of Lightning's Trainer work (limits of batches and steps, overfitting, profilers,
+strategies, precisions), and a seed reproduces losses bit for bit."""
 
 import lightning.pytorch as L
 import pytest
@@ -21,7 +21,7 @@ CONFIG = {"seed": 3, "resume": None, "init_from": None, "optimizer": {"lr": 0.05
 
 
 class Seen(L.Callback):
-    """Steps' first photographs, and numbers of validated batches."""
+    """Records a sum of the images of each step, and counts validated batches."""
 
     def __init__(self):
         self.trained, self.validated, self.steps = [], 0, []
@@ -37,7 +37,7 @@ class Seen(L.Callback):
 
 
 def fit(folder, **options) -> tuple[L.Trainer, Seen]:
-    """A training of 6 steps with ``options``."""
+    """Train 6 steps with ``options``."""
     seen = Seen()
     best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     chosen = {"accelerator": "cpu", "max_steps": 6, "val_check_interval": 6, **options}
@@ -55,8 +55,7 @@ def fit(folder, **options) -> tuple[L.Trainer, Seen]:
 
 
 def test_an_epoch_of_fewer_batches_goes_on_with_the_next(tmp_path):
-    """``limit_train_batches`` makes epochs shorter,
-    and the samples of a step stay those of the step."""
+    """``limit_train_batches`` shortens epochs but does not change the samples of a step."""
     (whole, all_of_them), (trainer, seen) = fit(tmp_path), fit(tmp_path, limit_train_batches=2)
     assert (whole.current_epoch, trainer.current_epoch) == (2, 3)
     assert trainer.global_step == len(seen.trained) == 6
@@ -78,7 +77,7 @@ def test_a_training_ends_when_its_time_is_up(tmp_path):
 
 @pytest.mark.parametrize("batches", [2, 0.5])
 def test_the_same_batches_again_and_again(tmp_path, batches):
-    """A model that cannot overfit two batches is wrong."""
+    """``overfit_batches`` repeats the first batches, on which a correct model must overfit."""
     _, whole = fit(tmp_path)
     trainer, seen = fit(tmp_path, overfit_batches=batches)
     assert trainer.global_step == 6
@@ -95,14 +94,13 @@ def test_a_few_steps_for_trying_out(tmp_path, value, steps):
 
 @pytest.mark.parametrize("profiler", ["simple", "advanced"])
 def test_a_profile_is_a_file_of_the_run(tmp_path, profiler):
-    """Its log lines are silenced with Lightning's others."""
+    """The profile is written to a file, as Lightning's log lines are silenced."""
     fit(tmp_path, profiler=profiler, max_steps=2)
     assert "optimizer_step" in (tmp_path / "fit-profile.txt").read_text()
 
 
 def test_options_of_lightning_reach_it(monkeypatch):
-    """Whatever a key is called, it must arrive;
-    several processes allow parameters without a gradient."""
+    """Options reach Lightning's Trainer, and several processes allow parameters without a gradient."""
     seen = []
     monkeypatch.setattr(L, "Trainer", lambda **arguments: seen.append(arguments))
     for options in (
@@ -131,7 +129,7 @@ def test_options_of_lightning_reach_it(monkeypatch):
     ],
 )
 def test_what_it_cannot_do_is_one_line(options, message):
-    """Tracebacks of frozen dataclasses and of packages that are not installed."""
+    """Unsupported values raise a one-line error instead of Lightning's tracebacks."""
     with pytest.raises(InputError) as caught:
         TrainerOptions(**options).build()
     assert message in str(caught.value)
@@ -149,11 +147,11 @@ class Curve(L.Callback):
 
 
 def curve_of(folder, workers: int, noise: int) -> tuple[list[float], torch.Tensor]:
-    """Losses of some steps of a real model, and all its weights at the end."""
+    """Losses of a few steps of a real model, and its final weights."""
     model, curve = make_model(), Curve()
     batches = [training_batch(size=size) for size in (28, 42, 28)]
     data = DataLoader(batches, batch_size=None, collate_fn=lambda b: b, num_workers=workers)
-    torch.manual_seed(noise)  # what the process drew before must not matter
+    torch.manual_seed(noise)  # the state of the global generator must not matter
     module = GHGSModule(model, Renderer(backend="cpu"), LOSSES, Optimization(lr=1e-3), config() | {"seed": 5})
     trainer = L.Trainer(
         accelerator="cpu", max_steps=3, max_epochs=-1, default_root_dir=folder, callbacks=[curve],
@@ -166,8 +164,7 @@ def curve_of(folder, workers: int, noise: int) -> tuple[list[float], torch.Tenso
 
 @pytest.mark.filterwarnings("ignore:.*fork.*")
 def test_a_curve_does_not_depend_on_the_number_of_loading_processes(tmp_path):
-    """Equal losses and weights in every bit;
-    what a batch is for any number is tested with the data."""
+    """Losses and weights are bit-identical; that batches are, too, is tested with the data."""
     before = torch.are_deterministic_algorithms_enabled()
     try:
         losses, weights = curve_of(tmp_path, 0, noise=1)
