@@ -15,7 +15,7 @@ from PIL import Image
 from ghgs_capture.calibration import same_ratio
 from ghgs_capture.photographs import MASK_ENDING, Pixels, image_named, mask_alike, read_pixels
 from ghgs_lit.data.images import read_image
-from ghgs_lit.errors import choice, installed, require
+from ghgs_lit.errors import import_optional, require, require_choice
 
 SEGMENTERS = ("rembg",)  #: Choices of ``segment``
 _LABELS = 32  # Labels of body parts are numbers below this; alpha and probabilities reach 255
@@ -127,8 +127,8 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
     Raises:
         InputError: the name is unknown, or the package is not installed.
     """
-    choice("segment", name, SEGMENTERS)
-    rembg = installed("rembg", "segment", "segment")
+    require_choice("segment", name, SEGMENTERS)
+    rembg = import_optional("rembg", "segment", "segment")
     session = rembg.new_session()
 
     def matte(pixels: Pixels) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ghgs_lit.errors import InputError, installed, require
+from ghgs_lit.errors import InputError, import_optional, require
 from ghgs_lit.parsing import require_file
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -113,7 +113,7 @@ def _read_video(path: Path, changed: int) -> Video:
 
 
 def _source(path: Path, seek: float = 0.0, log: str = "quiet") -> list[str]:
-    ffmpeg = installed("imageio_ffmpeg", "video", str(path)).get_ffmpeg_exe()
+    ffmpeg = import_optional("imageio_ffmpeg", "video", str(path)).get_ffmpeg_exe()
     start = ["-ss", f"{seek:.6f}"] if seek > 0 else []
     return [ffmpeg, "-v", log, "-nostdin", "-copyts", *start, "-i", str(path), "-map", "0:v:0"]
 

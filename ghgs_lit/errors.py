@@ -8,7 +8,7 @@ class InputError(ValueError):
     """Bad input; the message names the path or key, the expectation and the value."""
 
 
-def choice(key: str, value: object, allowed: tuple) -> None:
+def require_choice(key: str, value: object, allowed: tuple) -> None:
     """Reject a value of a configuration key that is not among those allowed.
 
     Args:
@@ -20,7 +20,9 @@ def choice(key: str, value: object, allowed: tuple) -> None:
         InputError: names the key, all allowed values and ``value``.
     """
     if value not in allowed:
-        raise InputError(f"{key}: expected one of {', '.join(map(str, allowed))}; found {shown(value)}")
+        raise InputError(
+            f"{key}: expected one of {', '.join(map(str, allowed))}; found {format_value(value)}"
+        )
 
 
 def require(condition: bool, key: str, expected: str, found: object) -> None:
@@ -30,16 +32,16 @@ def require(condition: bool, key: str, expected: str, found: object) -> None:
         condition: whether the value is valid.
         key: path or dotted key of the value.
         expected: a valid value, in words.
-        found: the value, formatted by :func:`shown`.
+        found: the value, formatted by :func:`format_value`.
 
     Raises:
         InputError: "<key>: expected <expected>; found <found>".
     """
     if not condition:
-        raise InputError(f"{key}: expected {expected}; found {shown(found)}")
+        raise InputError(f"{key}: expected {expected}; found {format_value(found)}")
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """Format a value for a message by ``repr``, except integers of more than 4300 digits, where it
     fails."""
     try:
@@ -48,7 +50,7 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__} that is too long to show"
 
 
-def installed(package: str, extra: str, key: str) -> ModuleType:
+def import_optional(package: str, extra: str, key: str) -> ModuleType:
     """Import an optional dependency, which an extra of this package installs.
 
     Args:

@@ -14,14 +14,14 @@ import numpy as np
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.sampling import RING_VIEW
-from ghgs_lit.errors import choice
+from ghgs_lit.errors import require_choice
 from ghgs_people import bench
 from ghgs_people.jobs import RenderOptions, SyntheticSource, everything, render_people
 from ghgs_people.rig import Rig
 
 
 def main(split: str) -> None:
-    choice("split", split, bench.SPLITS)
+    require_choice("split", split, bench.SPLITS)
     made, names, positions = bench.definition(split), bench.names(split), bench.POSITIONS
     seed, rig = made["data"]["people_seed"], Rig(height=made["data"]["rig"]["height"])
     wanted = made["data"]["render"]

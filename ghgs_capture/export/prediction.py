@@ -17,7 +17,7 @@ from ghgs_capture.export.page import page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
 from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
 from ghgs_capture.formats.matrices import camera_entry, cameras_json
-from ghgs_lit.errors import InputError, choice, installed, require
+from ghgs_lit.errors import InputError, import_optional, require, require_choice
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.geometry.masks import unmultiplied
 from ghgs_lit.metrics import psnr
@@ -190,9 +190,9 @@ def output_options(verb: "Predict") -> OutputOptions:
     formats = [formats] if isinstance(formats, str) else formats
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
     for name in formats:
-        choice("formats", name, ("all", *FORMATS))
+        require_choice("formats", name, ("all", *FORMATS))
         if FORMATS[name].package is not None:
-            installed(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
+            import_optional(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
     frames = verb.turntable.frames
     require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
     return OutputOptions(formats, verb.up, verb.smooth, frames, verb.turntable.fps)

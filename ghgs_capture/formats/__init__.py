@@ -7,7 +7,7 @@ from ghgs_capture.formats.colmap import find_model, read_colmap
 from ghgs_capture.formats.entries import CameraFile
 from ghgs_capture.formats.matrices import EASYMOCAP, QUALISYS, list_yaml, read_mapping, read_matrices
 from ghgs_capture.formats.nerfstudio import read_nerfstudio
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require, require_choice
 from ghgs_lit.parsing import find_path
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
@@ -40,7 +40,7 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
         InputError: no such path or format, or a wrong camera.
     """
     path = Path(path).expanduser()
-    choice("calibration.format", format, ("auto", *FORMATS))
+    require_choice("calibration.format", format, ("auto", *FORMATS))
     if not path.exists():
         raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
     if format != "auto" and path.is_file():

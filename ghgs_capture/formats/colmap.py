@@ -5,7 +5,7 @@ from pathlib import Path
 from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.formats.entries import CameraFile, Entries, pinhole
 from ghgs_capture.formats.matrices import read_camera
-from ghgs_lit.errors import InputError, installed, require
+from ghgs_lit.errors import InputError, import_optional, require
 from ghgs_lit.parsing import require_file
 
 #: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
@@ -54,7 +54,7 @@ def read_colmap(path: Path) -> CameraFile:
     """
     folder = find_model(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
-    pycolmap = installed("pycolmap", "colmap", str(path))
+    pycolmap = import_optional("pycolmap", "colmap", str(path))
     for file in folder.iterdir():
         if file.stem in _FILES:
             require_file(file, "a file of a COLMAP model")

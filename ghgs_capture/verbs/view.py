@@ -25,7 +25,7 @@ from ghgs_capture.formats.matrices import read_matrices
 from ghgs_capture.verbs import predict
 from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.data.images import read_image
-from ghgs_lit.errors import InputError, choice, installed, require
+from ghgs_lit.errors import InputError, import_optional, require, require_choice
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.method.bounds import VisualHull
@@ -79,7 +79,7 @@ def read_content(path: str | Path, up: str | None) -> Content:
         InputError: ``path`` is neither, or a file in it is missing or wrong.
     """
     path = Path(path)
-    choice("up", up, (None, *AXES))
+    require_choice("up", up, (None, *AXES))
     if path.is_file():
         return Content(read_ply(path), torch.tensor(AXES[up or "y"]))
     require(path.is_dir(), f"path={path}", "a directory of ghgs predict or a PLY", "neither")
@@ -167,7 +167,7 @@ class Viewer:
     """
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
-        viser = installed("viser", "viewer", "ghgs view")
+        viser = import_optional("viser", "viewer", "ghgs view")
         _require_address(host)
         self.content = content
         logging.getLogger("websockets").setLevel(logging.WARNING)  # no line for each visitor

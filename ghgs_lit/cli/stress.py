@@ -19,7 +19,7 @@ from ghgs_lit.diagnostics.output import document, pivoted, print_tables
 from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require, require_choice
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import provenance
@@ -88,7 +88,7 @@ def tasks_of(
     """
     for key, names, known in (("stages", stages, STAGES), ("families", families, FAMILIES)):
         for name in names or ():
-            choice(key, name, tuple(known))
+            require_choice(key, name, tuple(known))
     tasks = []
     for name in STAGES if stages is None else stages:
         seeds = STAGES[name].seeds

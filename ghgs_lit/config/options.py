@@ -29,7 +29,7 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from ghgs_lit.errors import InputError, require, shown
+from ghgs_lit.errors import InputError, format_value, require
 
 _NOUNS = {type(None): "null", bool: "true or false", int: "an integer", float: "a number"}
 _NOUNS |= {str: "a text", tuple: "a list", dict: "a mapping"}
@@ -149,7 +149,7 @@ CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """`` (did you mean ...?)`` with the closest known name, or an empty string."""
-    close = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), 1)
+    close = difflib.get_close_matches(name if isinstance(name, str) else format_value(name), list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
@@ -229,7 +229,7 @@ class Options(BaseModel, metaclass=_Checked):
         if OmegaConf.is_config(values):
             values = OmegaConf.to_container(values, resolve=True)
         if not isinstance(values, Mapping):
-            raise InputError(f"{key}: expected a mapping of its keys; found {shown(values)}")
+            raise InputError(f"{key}: expected a mapping of its keys; found {format_value(values)}")
         try:
             return cls.model_validate(dict(values))
         except ValidationError as error:
@@ -255,7 +255,9 @@ class Options(BaseModel, metaclass=_Checked):
             InputError: "<name>: expected <expected>; found ...".
         """
         if not condition:
-            raise InputError(f"{name}: expected {expected}; found {shown(_plain(getattr(self, name)))}")
+            raise InputError(
+                f"{name}: expected {expected}; found {format_value(_plain(getattr(self, name)))}"
+            )
 
     def build(self) -> Any:
         """Build the object that the options describe; by default the options themselves."""
@@ -308,7 +310,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
     wanted = str(cause) if cause is not None else expected(field) if field is not None else first["msg"]
-    return InputError(f"{dotted}: expected {wanted}; found {shown(_plain(values))}")
+    return InputError(f"{dotted}: expected {wanted}; found {format_value(_plain(values))}")
 
 
 def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 from omegaconf import OmegaConf
 
 from ghgs_lit.config.options import Options, did_you_mean
-from ghgs_lit.errors import InputError, shown
+from ghgs_lit.errors import InputError, format_value
 
 VARIABLE = "GHGS_PLUGINS"
 GROUP = "ghgs_lit.plugins"
@@ -304,7 +304,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
         names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
         raise InputError(
-            f"{key}{'.kind' * (group in KINDS)}: expected {expected}; found {shown(kind)}"
+            f"{key}{'.kind' * (group in KINDS)}: expected {expected}; found {format_value(kind)}"
             f"{did_you_mean(kind, names)} ({VARIABLE}=file.py adds kinds of your own)"
         )
     return _class_of(known[kind])
@@ -338,7 +338,7 @@ def read_node(node: Any, key: str) -> Options:
     if isinstance(node, Options):
         return node
     if not isinstance(node, Mapping):
-        raise InputError(f"{key}: expected a mapping of its keys; found {shown(node)}")
+        raise InputError(f"{key}: expected a mapping of its keys; found {format_value(node)}")
     values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
     cls = class_of_node(values, key)
     if None not in KINDS[key.split(".")[0]]:

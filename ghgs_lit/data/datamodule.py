@@ -28,7 +28,7 @@ from ghgs_lit.data.sampling import (
     ViewProtocol,
     evaluation_samples,
 )
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError, require_choice
 from ghgs_lit.types import Batch
 
 if TYPE_CHECKING:  # which builds the module
@@ -123,7 +123,7 @@ class PhotographsDataModule(LightningDataModule):
             InputError: the data set has no such split.
         """
         for split in splits:
-            choice("split", split, self.dataset.split_names)
+            require_choice("split", split, self.dataset.split_names)
         self.dataset.prepare(splits)
 
     def photographs(self, phase: str) -> Photographs:
@@ -132,7 +132,7 @@ class PhotographsDataModule(LightningDataModule):
         Raises:
             InputError: the data set has no such split.
         """
-        choice("split", phase, self.dataset.split_names)
+        require_choice("split", phase, self.dataset.split_names)
         if phase not in self._photographs:
             data = self.dataset
             options = data.size, data.cache_images_mb, data.resampling, data.target_size

@@ -18,7 +18,7 @@ from scipy import sparse
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
-from ghgs_lit.errors import InputError, installed
+from ghgs_lit.errors import InputError, import_optional
 from ghgs_lit.parsing import require_file
 
 VERTICES = 6890
@@ -126,7 +126,7 @@ class Body:
 
 @functools.lru_cache(maxsize=1)
 def _model(path: Path) -> torch.nn.Module:
-    smplx = installed("smplx", "smpl", "data.smpl_model")
+    smplx = import_optional("smplx", "smpl", "data.smpl_model")
     struct = importlib.import_module("smplx.utils").Struct(**read_model(path))
     with contextlib.redirect_stdout(io.StringIO()):  # smplx prints the number of shape components
         return smplx.SMPL("", data_struct=struct, gender="neutral").eval()

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ghgs_lit.config import nodes
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError, require_choice
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
 from ghgs_lit.geometry.masks import coverage, surface_colors, with_matte
 from ghgs_lit.geometry.projection import focal_lengths, unproject_maps, world_to_camera
@@ -333,7 +333,7 @@ def baseline(
     Raises:
         InputError: There is no such baseline.
     """
-    choice("baselines", name, BASELINES)
+    require_choice("baselines", name, BASELINES)
     if name in DEPTH_OF:
         return partial(render_discs, depth_of=DEPTH_OF[name], renderer=renderer)
     if name == "per_scene":

@@ -6,7 +6,7 @@ from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.run import Run
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import TargetProtocol
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require, require_choice
 
 
 def target_protocols(run: Run) -> dict[str, dict[str, Any]]:
@@ -51,7 +51,7 @@ def check_evaluation(run: Run, data: PhotographsDataModule) -> None:
     }
     run.metrics.build()
     split = run.evaluation.split
-    choice("evaluation.split", split, data.dataset.split_names)
+    require_choice("evaluation.split", split, data.dataset.split_names)
     data.prepare_data([split])
     require(len(data.subjects(split)) > 0, f"evaluation.split={split}", "a subject or more", "none")
     for count in views:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ghgs_lit.errors import choice
+from ghgs_lit.errors import require_choice
 from ghgs_lit.execution.capture import NotCapturable
 from ghgs_lit.execution.checks import Finding, any_bad, refuse
 from ghgs_lit.execution.graphs import GraphCache, described, with_memory
@@ -66,7 +66,7 @@ class Predictor:
         precision: str = "inherit",
         checks_values: bool = True,
     ):
-        choice("precision", precision, PRECISIONS)
+        require_choice("precision", precision, PRECISIONS)
         self.model = model
         self.options = options or ModelOptions.read(model.config.get("model") or {}, "model")
         self.precision = precision

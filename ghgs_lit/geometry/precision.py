@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require, require_choice
 
 PRECISIONS = ("inherit", "float32", "tf32", "bfloat16", "float16", "auto")
 
@@ -53,7 +53,7 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
         InputError: for an unknown precision, TF32 or float16 on a CPU, or bfloat16 on a device
             without it.
     """
-    choice("precision", name, PRECISIONS)
+    require_choice("precision", name, PRECISIONS)
     if name == "inherit":
         return _inherited() if device.type == "cuda" else nullcontext()
     if name == "bfloat16":

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require, require_choice
 from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
@@ -120,7 +120,7 @@ def ssim_map(
     Raises:
         InputError: the images are smaller than the window and not padded with zeros, or ``padding``
             is unknown."""
-    choice("ssim.padding", padding, PADDINGS)
+    require_choice("ssim.padding", padding, PADDINGS)
     found = tuple(image.shape[-2:])
     large = padding == "zeros" or min(found) >= SSIM_WINDOW
     expected = f"images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, or padding zeros"

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.errors import InputError, installed
+from ghgs_lit.errors import InputError, import_optional
 from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
     BESIDE,
@@ -63,7 +63,7 @@ class LPIPS:
         InputError: torchvision or the weights are not available."""
 
     def __init__(self, signed: bool = True, key: str = "LPIPS"):
-        installed("torchvision", "lpips", key)
+        import_optional("torchvision", "lpips", key)
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         try:

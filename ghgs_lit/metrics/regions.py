@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import choice
+from ghgs_lit.errors import require_choice
 from ghgs_lit.geometry.masks import between, first_and_last
 
 REGIONS = ("image", "box", "subject", "crop", "edge")
@@ -101,7 +101,7 @@ def region_of(
 
     Raises:
         InputError: the region is unknown."""
-    choice("region", name, REGIONS)
+    require_choice("region", name, REGIONS)
     if name == "image":
         return None
     if name == "crop":

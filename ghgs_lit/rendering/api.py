@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ghgs_lit.config.options import Options, Positive
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require, require_choice
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
 from ghgs_lit.ops.rasterization.settings import RasterSettings
@@ -106,7 +106,7 @@ def resolve_backend(backend: str, device: torch.device) -> str:
         InputError: the backend is unknown or does not run on ``device``.
         BackendUnavailable: gsplat cannot run on this machine.
     """
-    choice("renderer.backend", backend, BACKENDS)
+    require_choice("renderer.backend", backend, BACKENDS)
     if backend == "auto":
         require(device.type in _OF_DEVICE, "renderer.backend=auto", "tensors on cuda or cpu", str(device))
         backend = _OF_DEVICE[device.type]

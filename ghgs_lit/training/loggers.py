@@ -12,7 +12,7 @@ from torch.utils.tensorboard.summary import hparams
 
 from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.options import Options
-from ghgs_lit.errors import installed
+from ghgs_lit.errors import import_optional
 from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
 from ghgs_lit.runs.run import RunDirectory
@@ -142,7 +142,7 @@ class WandbOptions(Options):
 
         Raises:
             InputError: the extra is not installed."""
-        installed("wandb", "wandb", "logger.wandb")
+        import_optional("wandb", "wandb", "logger.wandb")
         project = os.environ.get("WANDB_PROJECT", "ghgs_lit")
         identity = RunDirectory(Path(save_dir)).marker
         return WandbLog(project=project, save_dir=save_dir, id=identity and identity.id)

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, installed, require
+from ghgs_lit.errors import InputError, import_optional, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights.checkpoint import (
     describe,
@@ -98,7 +98,7 @@ def fetch(repository: str) -> tuple[str, Path, str]:
         InputError: the package huggingface_hub, the network or the repository is not available, or
             the checksum differs from the published one.
     """
-    hub = installed("huggingface_hub", "hub", repository)
+    hub = import_optional("huggingface_hub", "hub", repository)
     cached = hub.try_to_load_from_cache(repository, FILE)
     if not isinstance(cached, str):
         try:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pandas as pd
 
 from ghgs_lit.config.keys import ABLATIONS
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require, require_choice
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table, TableOptions, data_title, paper
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
@@ -64,7 +64,7 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
     rows = pd.concat([ours, *others], ignore_index=True)
     known = [name for name in rows if name not in _FACTS and rows[name].notna().any()]
     for name in options.metrics or ():
-        choice("columns", name, tuple(known))
+        require_choice("columns", name, tuple(known))
     same = [name for name in SETTING if layout.columns != "data" or name != "data"]
     if layout.rows == "ablation":
         rows["trained"] = [variant.trained for variant in rows["variant"]]

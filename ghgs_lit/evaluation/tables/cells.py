@@ -8,7 +8,7 @@ from itertools import combinations, product
 import pandas as pd
 
 from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError, require_choice
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of, paper
 from ghgs_lit.evaluation.tables.runs import TRAINING
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
@@ -46,7 +46,7 @@ def fill(table: Table) -> None:
         _mark_best(table, means.round(metric_of(column[1]).decimals), metric_of(column[1]).arrow)
     if table.options.test.against != "none":
         for name in table.tested:
-            choice("test.metrics", name, tuple(table.metrics))
+            require_choice("test.metrics", name, tuple(table.metrics))
         _test(table, _values_by_person(table, values), competing)
 
 
