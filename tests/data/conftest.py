@@ -1,4 +1,4 @@
-"""Small data sets that the tests of a process share and never change."""
+"""Small data sets that all tests of a process share and do not change."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def boxes(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def zju_root(tmp_path_factory) -> Path:
-    """One sequence of each generation with two frames."""
+    """ZJU-MoCap sequences of both generations, with two frames each."""
     folder = tmp_path_factory.mktemp("zju_mocap")
     make_miniature(zju_mocap, folder, ["386", "313"], 112, seed=3, frames=2)
     return folder
@@ -27,7 +27,7 @@ def zju_root(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def humman_root(tmp_path_factory) -> Path:
-    """A sequence for testing and one for training, of three frames."""
+    """HuMMan sequences with three frames, one for validation and one for training."""
     folder = tmp_path_factory.mktemp("humman") / "recon"
     make_miniature(humman, folder, ["p000455_a000986"], {"train": 1, "val": 1}, 160, seed=3)
     return folder

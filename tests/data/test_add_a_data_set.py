@@ -1,5 +1,5 @@
-"""A data set of one's own: the documentation's template, found by the command line,
-trained and measured."""
+"""A custom data set from the documentation's template: registered, trained and evaluated from the
+command line."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ KEYS = {
 
 @pytest.fixture
 def project(tmp_path):
-    """A user's folder: one Python file, one YAML, and a toy data set."""
+    """A user's folder with one Python file, one YAML file and a toy data set."""
     shutil.copy(TEMPLATE / "my_people.py", tmp_path / "my_people.py")
     shutil.copytree(TEMPLATE / "conf", tmp_path / "conf")
     cameras = ring(CAMERAS, SIZE)
@@ -51,7 +51,7 @@ def project(tmp_path):
 
 @pytest.fixture(autouse=True)
 def clean(monkeypatch):
-    """Each test starts without admitted or imported modules."""
+    """Start each test without registered or imported plug-ins."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(registry.VARIABLE, raising=False)
     monkeypatch.setattr(registry, "_REGISTERED", {})
@@ -68,7 +68,7 @@ def node(project: Path, **changes) -> dict:
 
 
 def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, capsys):
-    """The documentation's commands."""
+    """The documentation's commands train and evaluate on the data set."""
     monkeypatch.chdir(project)
     monkeypatch.setenv(registry.VARIABLE, "my_people.py")
     code = ghgs(
@@ -80,12 +80,12 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
     content = json.loads(Path("run/metrics.json").read_text())
     assert content["provenance"]["data"] == {"name": "my_people", "resampling": "area", "split": "val"}
     assert content["provenance"]["training"]["steps"] == 2
-    # One subject; every camera that is not an input is a target.
+    # One subject, with every camera that is not an input as a target.
     before = {row["target"]: row["psnr"] for row in content["rows"]}
     assert {row["subject"] for row in content["rows"]} == {"c"}
     assert len(before) == CAMERAS - 3
     assert np.isfinite(list(before.values())).all()
-    # Its checkpoint is measured with the same admission, and refused without.
+    # The checkpoint can be evaluated only with the plug-in.
     arguments = [
         "evaluate", "checkpoint=run/checkpoints/last.ckpt", "views=v3", "targets=cameras",
         "evaluation.targets=[cameras]", "evaluation.pictures=0", "hydra.run.dir=measured",
@@ -104,8 +104,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
 
 
 def test_the_template_passes_the_check(project, monkeypatch):
-    """task=check asks for the static cameras alone, whatever the protocol's views,
-    and counts the bodies."""
+    """task=check requires only the static cameras, whatever the protocol's views, and counts the bodies."""
     monkeypatch.setenv(registry.VARIABLE, str(project / "my_people.py"))
     release = {"name": "release", "training_views": [2, 3, 4]}
     report = inspect(build(node(project), "data", **KEYS | {"targets": release}))
@@ -114,7 +113,7 @@ def test_the_template_passes_the_check(project, monkeypatch):
 
 
 def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
-    """Cameras, masks and bodies of the template reach the batch; what it cannot give is refused."""
+    """Batches contain the template's cameras, masks and bodies; missing views and files are rejected."""
     monkeypatch.setenv(registry.VARIABLE, str(project / "my_people.py"))
     data = build(node(project), "data", **KEYS)
     (batch,) = list(data.evaluation_loader())
@@ -124,7 +123,7 @@ def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
     assert torch.allclose(batch.cameras.intrinsics[0], expected.intrinsics[[0, 2, 5]], atol=1e-4)
     assert torch.allclose(batch.cameras.extrinsics[0], expected.extrinsics[[0, 2, 5]], atol=1e-5)
     assert batch.masks.float().mean().item() == pytest.approx(40 * 16 / 60**2, abs=0.01)
-    # Other processes find the class, too.
+    # Other processes can import the class, too.
     assert str(project) in sys.path
     between = {"name": "cameras", "view": 3}
     with pytest.raises(InputError, match="found cameras, which asks for views between cameras"):
@@ -135,7 +134,7 @@ def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
 
 
 def test_nothing_is_admitted_by_a_configuration(project):
-    """A checkpoint of somebody else cannot have foreign code imported."""
+    """A configuration, such as that of a downloaded checkpoint, cannot import foreign code."""
     for kind in ("my_people", "my_people.MyPeople", "os.system"):
         with pytest.raises(InputError, match=r"data\.kind: expected one of"):
             build(node(project, kind=kind), "data")
@@ -143,7 +142,7 @@ def test_nothing_is_admitted_by_a_configuration(project):
 
 
 def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch):
-    """Both documented ways of admitting code register its kinds."""
+    """Both documented ways to load plug-ins register their kinds."""
     monkeypatch.syspath_prepend(str(project))
     points = {registry.GROUP: [SimpleNamespace(value="my_people")]}
     for admit in (
@@ -164,7 +163,7 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
 
 
 def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
-    """A wrong GHGS_PLUGINS names its file; an error inside the file is not hidden."""
+    """A wrong GHGS_PLUGINS is reported with its file, and an error inside the file is not hidden."""
     for name, said in (
         ("none.py", r"found no .*none\.py"),
         ("json.py", "no other module has"),
@@ -175,7 +174,7 @@ def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
         monkeypatch.setenv(registry.VARIABLE, str(tmp_path / name))
         with pytest.raises(InputError, match=said):
             build({"kind": "x"}, "bounds")
-    # An error in the user's own file is shown as it is.
+    # An error in the user's file is raised unchanged.
     (tmp_path / "numbers_of_mine.py").write_text("1 / 0")
     monkeypatch.setenv(registry.VARIABLE, str(tmp_path / "numbers_of_mine.py"))
     with pytest.raises(ZeroDivisionError):

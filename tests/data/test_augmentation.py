@@ -1,5 +1,4 @@
-"""Variation of training batches: what each switch changes,
-and that batches depend on seed and step alone."""
+"""Augmentation of training batches: effects of each option, and dependence on seed and step only."""
 
 import numpy as np
 import pytest
@@ -28,11 +27,11 @@ def module(boxes, **changes):
 
 
 def test_nothing_varies_by_default(boxes):
-    """augmentation=none and no augmentation give the photographs as they are read, to the bit."""
+    """augmentation=none and no augmentation leave images as read, bit for bit."""
     none = compose("train").augmentation
     assert Augmentation.read(none, "augmentation") == Augmentation()
     data = module(boxes, augmentation=none)
-    # for measurements alone
+    # Depths of targets are only for measurements.
     for step in range(3):
         batch = data.photographs("train").batch(data.training_sampler().batch(step), target_depths=False)
         assert equal(data.training_batch(step), batch)
@@ -40,7 +39,7 @@ def test_nothing_varies_by_default(boxes):
 
 
 def test_batches_depend_on_seed_and_step_alone(boxes):
-    """Neither on loading processes nor on what was read before; steps and seeds differ."""
+    """Batches depend neither on workers nor on what was read before, and differ between steps and seeds."""
     batches = list(module(boxes, augmentation=EVERYTHING, seed=2, workers=2).train_dataloader())
     assert len(batches) == 6
     data = module(boxes, augmentation=EVERYTHING, seed=2)
@@ -52,8 +51,7 @@ def test_batches_depend_on_seed_and_step_alone(boxes):
 
 
 def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
-    """The same photographs in another step, run or place of the batch are imperfect in
-    another way."""
+    """The same images get other imperfections in another step, run or place of the batch."""
     clean, varied = module(boxes).training_batch(0), Augmentation(**EVERYTHING)
 
     def drawn(seed, step, indices=(6, 7)):
@@ -87,7 +85,7 @@ def test_sizes_of_a_class_are_drawn_once(boxes):
 
 
 def test_sizes_are_drawn_for_a_step_and_cameras_follow(boxes):
-    """Every size occurs, the same for all processes; targets are 0.7 to 2 times as large."""
+    """Every size occurs, equal in all processes, and targets are 0.7 to 2 times as large."""
     data = module(
         boxes, target_size=[84, 84], augmentation={"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
     )
@@ -113,15 +111,14 @@ def test_sizes_are_drawn_for_a_step_and_cameras_follow(boxes):
 
 
 def test_drawn_sizes_keep_the_proportion_of_the_targets(boxes):
-    """data.target_size twice data.size: targets are twice as large as the inputs that are drawn."""
+    """With data.target_size twice data.size, targets are twice as large as the sampled input size."""
     batch = module(boxes, target_size=56, augmentation={"sizes": [42]}).training_batch(0)
     assert batch.images.shape[-2:] == (42, 42)
     assert batch.targets.images.shape[-2:] == (84, 84)
 
 
 def test_targets_are_never_enlarged(boxes):
-    """Twice the size of the inputs is more than the photographs hold:
-    they stay as large as they are read."""
+    """Targets never exceed data.target_size, although the sampled scale would be twice the inputs' size."""
     data = module(boxes, target_size=42, augmentation={"target_scale": [1.0, 2.0]})
     sides = {data.training_batch(step).targets.images.shape[-1] for step in range(12)}
     assert 28 <= min(sides) < 36
@@ -129,7 +126,7 @@ def test_targets_are_never_enlarged(boxes):
 
 
 def test_a_share_of_the_steps_is_imperfect(boxes):
-    """The others are as they are read, to the bit; chance=1 is every step."""
+    """All other steps are as read, bit for bit; chance=1 means every step."""
     clean, some, every = (module(boxes, augmentation=a) for a in ({}, IMPERFECT | {"chance": 0.4}, IMPERFECT))
     steps = [(clean.training_batch(step), some.training_batch(step)) for step in range(40)]
     changed = [step for step, pair in enumerate(steps) if not equal(*pair)]
@@ -138,7 +135,7 @@ def test_a_share_of_the_steps_is_imperfect(boxes):
 
 
 def test_the_last_part_of_a_run_is_exact(boxes):
-    """From the step on that is named, to the bit; all before as without it."""
+    """From ``exact_from`` on, batches are as read; earlier ones are as without the option, bit for bit."""
     clean, always, first = (
         module(boxes, augmentation=a) for a in ({}, IMPERFECT, IMPERFECT | {"exact_from": 2})
     )
@@ -171,14 +168,14 @@ def differing(a, b) -> set[str]:
     ],
 )
 def test_each_imperfection_changes_its_part_of_the_inputs_alone(boxes, names, changed):
-    """Targets, depths and all else stay; together they are what they are alone."""
+    """Targets, depths and other inputs stay unchanged, and each imperfection acts alone as in combination."""
     chosen = {name: IMPERFECT[name] for name in names}
     clean, batch = (module(boxes, augmentation=a).training_batch(1) for a in ({}, chosen))
     assert differing(clean, batch) == changed
     together = module(boxes, augmentation=IMPERFECT).training_batch(1)
     everything = {"images", "masks", "alpha", "cameras.intrinsics", "cameras.extrinsics"}
     assert differing(clean, together) == everything
-    # A matte knows no more than the mask: nothing beside it, and all of what the mask adds.
+    # The matte follows the mask: 0 outside it, and 1 where the mask was enlarged.
     assert not together.alpha[~together.masks].any()
     assert (together.alpha[together.masks & ~clean.masks] == 1).all()
     kept = together.masks & clean.masks
@@ -192,7 +189,7 @@ def test_each_imperfection_changes_its_part_of_the_inputs_alone(boxes, names, ch
 
 
 def test_a_wrong_mask_shows_the_background(boxes):
-    """Pixels that a mask adds show what is behind them; where the mask is right nothing is new."""
+    """Pixels that a mask adds show the background; where the mask is right nothing changes."""
     outlines = {"mask_offset": 1.5, "mask_ragged": 1.0}
     clean, black, cloudy = (
         module(boxes, augmentation=a).training_batch(1)
@@ -209,7 +206,7 @@ def test_a_wrong_mask_shows_the_background(boxes):
 
 
 def test_refined_masks_are_those_of_a_capture(boxes):
-    """refined=1 finds mattes in the photographs, by as many pixels as outlines may be off."""
+    """refined=1 estimates mattes from the images, for outlines that are off by the configured pixels."""
     wrong = {"mask_offset": 1.5, "mask_ragged": 1.0, "background": 1.0}
     clean, given, found = (
         module(boxes, augmentation=a).training_batch(1) for a in ({}, wrong, wrong | {"refined": 1.0})
@@ -224,8 +221,7 @@ def test_refined_masks_are_those_of_a_capture(boxes):
 
 
 def test_tone_curves_raise_the_surface_to_a_power(boxes):
-    """One power for each camera; powers differ, their geometric mean is 1;
-    black and mattes stay."""
+    """Each camera has one power, powers differ with a geometric mean of 1, and black and mattes stay."""
     clean, toned = (module(boxes, augmentation=a).training_batch(1) for a in ({}, {"gamma": 0.3}))
     one, other = (surface_colors(batch).double() for batch in (clean, toned))
     sure = ((clean.alpha > 0.5)[:, :, None] & (one > 0.1) & (one < 0.9)).expand_as(one)
@@ -240,8 +236,8 @@ def test_tone_curves_raise_the_surface_to_a_power(boxes):
 
 
 def test_a_cut_moves_photographs_and_cameras_together(boxes):
-    """A point of the world shows what it showed, until it leaves the frame;
-    wholes are whole in some view."""
+    """World points keep their colours until they leave the frame, and subjects that are not cut everywhere
+    stay whole in some view."""
     clean = module(boxes).training_batch(1)
     kinds = set()
     for seed in range(12):
@@ -271,7 +267,7 @@ def test_a_cut_moves_photographs_and_cameras_together(boxes):
 
 
 def test_imperfections_do_not_depend_on_batch_mates(boxes):
-    """Two elements together are as each alone."""
+    """Two elements in a batch get the same imperfections as each alone."""
     batch = module(boxes).training_batch(0)
     augmentation = Augmentation(**IMPERFECT)
 
@@ -290,7 +286,7 @@ def test_imperfections_do_not_depend_on_batch_mates(boxes):
 
 
 def test_validation_does_not_vary(boxes):
-    """Numbers of different runs are measured on the same photographs."""
+    """All runs are validated on the same images."""
     clean, varied = (module(boxes, views=V4, augmentation=a) for a in ({}, EVERYTHING))
     pairs = list(zip(clean.val_dataloader(), varied.val_dataloader(), strict=True))
     assert [batch.subjects for batch, _ in pairs] == [("s3", "s4")]
@@ -301,7 +297,7 @@ def test_validation_does_not_vary(boxes):
 
 
 def test_shipped_variation_is_built():
-    """The option composes; its sizes fit the encoder's patch."""
+    """The shipped option composes, and its sizes are divisible by the encoder's patch size."""
     augmentation = read_node(compose("train", ["augmentation=captures"]).augmentation, "augmentation")
     assert all(side % 14 == 0 for size in augmentation.sizes for side in size)
     assert all(getattr(augmentation, name) > 0 for name in IMPERFECT)
@@ -322,6 +318,6 @@ def test_shipped_variation_is_built():
     ],
 )
 def test_impossible_values_are_refused(boxes, values, message):
-    """The message names the key."""
+    """The error names the key."""
     with pytest.raises(InputError, match=message):
         module(boxes, augmentation=values)

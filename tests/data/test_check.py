@@ -1,4 +1,4 @@
-"""What task=check finds without a body's help: masks, cameras, units, leakage."""
+"""Problems that task=check finds without a body: masks, cameras, units, leakage."""
 
 import shutil
 
@@ -15,7 +15,7 @@ PLACE = "train/mask/s0_008/0.png"
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
-    """Boxes, whose bodies of eight vertices check no camera."""
+    """Boxes, whose bodies of eight vertices are too few to check cameras."""
     folder = tmp_path_factory.mktemp("boxes")
     settings = TINY.replace(samples=1, positions=(0, 4, 8, 12), views=(0, 3))
     render_boxes(folder / "root", folder / "scans", train=2, val=1, settings=settings)
@@ -34,13 +34,13 @@ def report(root, **changes):
 
 
 def change(root, kind: str, function, names: str = "s0_*") -> None:
-    """Replace matrices of cameras by ``function`` of them."""
+    """Apply ``function`` to the matrices of cameras."""
     for path in sorted(root.glob(f"train/parm/{names}/*_{kind}.npy")):
         np.save(path, function(np.load(path)))
 
 
 def paint(root, function) -> None:
-    """Replace the mask at :data:`PLACE`."""
+    """Apply ``function`` to the mask at :data:`PLACE`."""
     mask = np.asarray(Image.open(root / PLACE)) > 127
     Image.fromarray(function(mask).astype(np.uint8) * 255).save(root / PLACE)
 
@@ -86,8 +86,7 @@ DAMAGES = {
 
 
 def test_sound_data_agrees(root):
-    """Right masks and cameras pass; every subject's body is counted,
-    whether it checks cameras or not."""
+    """Correct masks and cameras pass, and every body is counted, also those that cannot check cameras."""
     found = report(root)
     assert found.problems == []
     assert found.notes == []
@@ -97,8 +96,7 @@ def test_sound_data_agrees(root):
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_damage_is_found_without_bodies(root, kind):
-    """Each defect that silhouettes show is one problem,
-    although no body says where the subject is."""
+    """Each defect that silhouettes reveal is reported as one problem, without any body."""
     shutil.rmtree(root / "train/smpl")
     damage, line = DAMAGES[kind]
     damage(root)
@@ -109,7 +107,7 @@ def test_damage_is_found_without_bodies(root, kind):
 
 
 def test_other_units_are_named(root):
-    """Cameras that all agree in millimetres are a note: nothing says that a subject is no giant."""
+    """Consistent cameras in millimetres give only a note, as the subject could be a giant."""
     for phase in ("train", "val"):
         for path in sorted(root.glob(f"{phase}/parm/*/*_extrinsic.npy")):
             np.save(path, np.load(path) * [1, 1, 1, 1000])
@@ -122,8 +120,7 @@ def test_other_units_are_named(root):
 
 
 def test_the_same_person_in_both_phases_is_a_problem(root):
-    """Leakage by id stops reading and the check;
-    the same photographs under another id stop the check."""
+    """A subject in both phases fails reading and the check; its images under another name fail the check."""
     for folder in sorted(root.glob("train/*/s1*")):
         renamed = folder.name.replace("s1", "other")
         shutil.copytree(folder, root / "val" / folder.parent.name / renamed)
@@ -144,7 +141,7 @@ def test_the_same_person_in_both_phases_is_a_problem(root):
 
 
 def test_bodies_are_counted_where_photographs_are_missing(root):
-    """A missing view is a problem of its own; the subject still has its body."""
+    """A missing view is one problem, and the subject's body is still counted."""
     for path in sorted(root.glob("train/img/s0_*/3.jpg")):
         path.unlink()
     found = report(root)

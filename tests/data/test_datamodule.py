@@ -1,4 +1,4 @@
-"""Options of data sets, splits of subjects, and the processes that load batches."""
+"""Options of data sets, splits of subjects, and loading of batches in worker processes."""
 
 import logging
 import os
@@ -24,8 +24,7 @@ from tests.helpers.people import TINY, equal, rendered
 
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
-    """Documented commands set data.root and data.batch_size in one node;
-    a path may be one of Python's."""
+    """data.root and data.batch_size are keys of one node, and paths may be ``pathlib`` objects."""
     data = rendered(Path("x"), batch_size=3, limit={"val": 2}, workers=1).dataset
     assert data == Scans(root="x", size=[28, 28], batch_size=3, limit={"val": 2}, workers=1, render=TINY)
     assert [data.limit.of(phase) for phase in ("train", "val", "bench")] == [None, 2, None]
@@ -43,13 +42,13 @@ def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
     ],
 )
 def test_a_wrong_key_is_named(options, key, hint):
-    """A misspelt key must never be swallowed."""
+    """A misspelt key must not be ignored."""
     with pytest.raises(InputError, match=f"data key: expected one of .*batch_size, .*; found '{key}'{hint}"):
         options(size=28, **{key: 1})
 
 
 def test_evaluation_takes_protocols_and_no_bare_names(tmp_path):
-    """A name alone would ignore the file of the protocol in conf/targets."""
+    """A bare name would ignore the protocol's file in conf/targets."""
     with pytest.raises(InputError, match="targets: expected a mapping of its keys; found 'midway'"):
         rendered(tmp_path).evaluation_loader(targets="midway")
 
@@ -59,7 +58,7 @@ def test_evaluation_takes_protocols_and_no_bare_names(tmp_path):
     [(3, 1, 4, 4, 3), (3, 2, 8, 8, 6), (5, 2, 8, 8, 10), (4, 2, 7, 7, 7), (5, 2, 7, 7, 9), (5, 2, 8, 4, 10)],
 )
 def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, length, limit, batches):
-    """Steps times the batches of a step; the last step of an epoch takes those that are left."""
+    """The count is steps times batches per step, where the last step of an epoch may have fewer batches."""
     trainer = SimpleNamespace(
         global_step=step, accumulate_grad_batches=accumulated, num_training_batches=limit
     )
@@ -68,7 +67,7 @@ def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, leng
 
 
 def test_depths_are_read_where_something_compares_with_them(boxes):
-    """Training without a term of depths reads none; evaluation measures depths all the same."""
+    """Training without a depth loss reads no depths; evaluation always does."""
     data = rendered(boxes)
     assert data.training_batch(0).depths is not None
     data.trains_on_depths = False
@@ -78,8 +77,7 @@ def test_depths_are_read_where_something_compares_with_them(boxes):
 
 @pytest.mark.parametrize("rank", [0, 1])
 def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch):
-    """Its number and how many there are come from the trainer;
-    three subjects are passed often in an epoch."""
+    """Rank and world size come from the Trainer, and an epoch has many passes over three subjects."""
     data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
     data.trainer.num_devices = 2
@@ -91,14 +89,14 @@ def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch)
         expected = [sample.subject for sample in drawn.batch(step, rank, 2)]
         assert list(batches[step].subjects) == expected
     monkeypatch.setattr("ghgs_lit.data.datamodule.LEAST_STEPS", 1)
-    assert len(data.train_dataloader().dataset) == 2  # of the three subjects, each process has half
+    assert len(data.train_dataloader().dataset) == 2  # half of the three subjects, rounded up
 
 
 NAMES = [f"s{i}" for i in range(10)]
 
 
 def test_a_share_of_the_scans_is_drawn(tmp_path):
-    """By the seed, where neither files nor lists decide."""
+    """Without files or lists, the seed determines the split."""
     drawn = split_names(tmp_path, NAMES, None, 0.2, 0)
     assert sorted(drawn["train"] + drawn["val"]) == NAMES
     assert len(drawn["val"]) == 2
@@ -108,7 +106,7 @@ def test_a_share_of_the_scans_is_drawn(tmp_path):
 
 @pytest.fixture
 def folders(tmp_path):
-    """Folders of split files: with both, without the second, with one id in both."""
+    """Folders with split files: both files, only the first, and both with a common id."""
     for name, val in (("both", "s3\n"), ("one", None), ("twice", "s2\n")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "split_train.txt").write_text("s1\ns2\n")
@@ -118,7 +116,7 @@ def folders(tmp_path):
 
 
 def test_files_and_lists_decide(folders):
-    """Files beside the scans before a draw; what is configured before both."""
+    """A configured split precedes split files, and these precede a random split."""
     listed = {"train": ["s4"], "val": ["s5"]}
     for split, expected in ((None, {"train": ["s1", "s2"], "val": ["s3"]}), (listed, listed)):
         assert split_names(folders / "both", NAMES, split, 0.2, 0) == expected
@@ -141,7 +139,7 @@ def test_bad_splits_are_refused(folders, split, line):
 
 
 def test_ranges_of_ids():
-    """Ranges select among the ids that exist."""
+    """Ranges select from the existing ids."""
     names = [f"{i:04d}" for i in range(0, 526, 25)]
     split = read_split({"train": ["0000-0425"], "val": ["0426-0525"]}, names)
     assert (len(split["train"]), len(split["val"])) == (18, 4)
@@ -151,7 +149,7 @@ def test_ranges_of_ids():
     ("count", "fraction", "measured"), [(1, 0.1, 1), (2, 0.1, 1), (4, 0.1, 1), (4, 0.0, 0), (2, 1, 2)]
 )
 def test_few_scans_leave_somebody_to_validate(tmp_path, count, fraction, measured):
-    """A tenth of four scans is one; all can be measured, or none."""
+    """A tenth of four scans is rounded up to one; shares of 0 and 1 give none and all."""
     names = [f"s{i}" for i in range(count)]
     drawn = split_names(tmp_path, names, None, fraction, 0)
     assert len(drawn["val"]) == measured
@@ -176,21 +174,20 @@ MANY = float("inf")
     ],
 )
 def test_processes_by_cores_devices_and_batches(monkeypatch, count, processes, on_gpu, cores, expected):
-    """A GPU leaves the cores to loading, a CPU none;
-    a few batches come sooner than a process starts."""
+    """With a GPU the cores load data, with a CPU they do not, and few batches do not justify workers."""
     monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "fork")
     assert choose_workers(count, processes, on_gpu, cores) == expected
 
 
 def test_processes_that_import_pytorch_first_start_for_more_batches(monkeypatch):
-    """As on macOS, where a start takes seconds."""
+    """Spawned workers, as on macOS, take seconds to start."""
     monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "spawn")
     assert choose_workers(100, 1, True, 96) == 0
     assert choose_workers(1000, 1, True, 96) == 8
 
 
 def test_automatic_processes_are_said_once_and_load_the_same(boxes, caplog):
-    """Evaluation with its few batches starts none and says nothing."""
+    """Training logs the number of workers once; evaluation with few batches starts none and logs nothing."""
     with caplog.at_level(logging.INFO):
         data = rendered(boxes, workers="auto", steps_per_epoch=3)
         loader = data.train_dataloader()
@@ -202,7 +199,7 @@ def test_automatic_processes_are_said_once_and_load_the_same(boxes, caplog):
 
 
 def test_batches_can_be_sent_to_processes_that_begin_anew(boxes):
-    """All that a spawned process receives, as on macOS."""
+    """Datasets can be pickled for spawned workers, as on macOS."""
     batches = rendered(boxes, augmentation={"gamma": 0.1}).train_dataloader().dataset
     batches[0]
     assert equal(pickle.loads(pickle.dumps(batches))[1], batches[1])
@@ -223,7 +220,7 @@ except KeyboardInterrupt:
 
 
 class Signalled:
-    """Batches, whose process gets the signal of an announced end with each."""
+    """Dataset whose items send its process SLURM's signal of an announced end."""
 
     def __len__(self):
         return 3
@@ -234,12 +231,12 @@ class Signalled:
 
 
 def test_an_announced_end_leaves_loading_to_the_training():
-    """SLURM sends the signal to all processes of a job; a worker ended, and with it the training."""
+    """SLURM sends the signal to all processes of a job; workers must ignore it and not end the training."""
     assert list(make_loader(Signalled(), 1)) == [0, 1, 2]
 
 
 def test_an_interrupt_ends_all_processes_without_their_traces(boxes):
-    """A terminal sends Ctrl-C to all of them; only the one that trains answers."""
+    """A terminal sends Ctrl-C to all processes; only the training process handles it."""
     process = subprocess.Popen(
         [sys.executable, "-c", _TRAINING, str(boxes)],
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Sequences of ZJU-MoCap and HuMMan-Recon: what every reader of frames does, on miniatures."""
+"""Behaviour common to the readers of ZJU-MoCap and HuMMan-Recon, on miniatures."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ from tests.helpers.captures import (
 )
 
 ZJU_SPLIT = "data.split={train: [{sequences: [386], FRAMES}], val: [{sequences: [SEQUENCE], FRAMES}]}"
-#: Folder of a sequence, names of one camera's photograph and mask in it, the subject and the camera.
+#: By data set: folder of a sequence, paths of a camera's image and mask in it, and the camera's index.
 CASES = {
     "zju_mocap": ("CoreView_386", "Camera_B8/000000.jpg", "mask_cihp/Camera_B8/000000.png", 7),
     "humman": ("p000455_a000986", *(f"kinect_{k}/kinect_007/000000.png" for k in ("color", "mask")), 7),
@@ -53,7 +53,7 @@ def photographs(kind: str, root: Path, size=None, *overrides: str) -> Photograph
 
 @each
 def test_the_background_is_black(roots, kind):
-    """The studio behind the performer must not reach the model."""
+    """The studio behind the performer must not be visible to the model."""
     overrides = ("data.undistorted=true", "data.undistorted=false") if kind == "zju_mocap" else ("seed=0",)
     for override in overrides:
         view = photographs(kind, roots[kind], None, override).view(f"{CASES[kind][0]}_000000", 2)
@@ -62,7 +62,7 @@ def test_the_background_is_black(roots, kind):
 
 
 def opencv_camera(kind: str, folder: Path, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K, R and T in metres of a camera, as they are stored."""
+    """Stored K, R and T of a camera, T in metres."""
     if kind == "humman":
         camera = json.loads((folder / "cameras.json").read_text())[f"kinect_color_{number:03d}"]
         return tuple(np.array(camera[key]) for key in "KRT")
@@ -73,8 +73,7 @@ def opencv_camera(kind: str, folder: Path, number: int) -> tuple[np.ndarray, np.
 @each
 @pytest.mark.parametrize("share", [1, 2, 4])
 def test_intrinsics_fit_resized_photographs(roots, tmp_path, kind, share):
-    """A spot where OpenCV sees a point is where the view's camera sees it,
-    to a fiftieth of a pixel."""
+    """A spot drawn where OpenCV's camera projects a point is where the view's camera projects it."""
     sequence, photograph, mask, number = CASES[kind]
     folder = shutil.copytree(roots[kind] / sequence, tmp_path / sequence)
     matrix, rotation, translation = opencv_camera(kind, folder, number)
@@ -93,7 +92,7 @@ def test_intrinsics_fit_resized_photographs(roots, tmp_path, kind, share):
 
 @each
 def test_targets_between_cameras_that_stand_still_are_refused(roots, kind):
-    """Views that do not exist are refused before anything is read."""
+    """Views that do not exist are rejected before anything is read."""
     module = data(kind, roots[kind], "targets=release")
     for draw in (
         module.training_sampler,
@@ -107,8 +106,7 @@ def test_targets_between_cameras_that_stand_still_are_refused(roots, kind):
 
 @pytest.mark.parametrize("sequence", ["386", "313"])
 def test_packed_frames_are_the_same(zju_root, tmp_path, sequence):
-    """Photographs without lens distortion, and with it in another file;
-    names of both generations."""
+    """Distorted and undistorted images have separate packed files, for names of both generations."""
     for override in ("data.undistorted=true", "data.undistorted=false"):
         reader = data("zju_mocap", zju_root, override, sequence=sequence).dataset.reader("val")
         require_same_packed(reader, tmp_path, (64, 48))
@@ -116,7 +114,7 @@ def test_packed_frames_are_the_same(zju_root, tmp_path, sequence):
 
 @each
 def test_the_same_numbers_make_the_same_miniature(roots, tmp_path, kind):
-    """A miniature is reproducible, whatever else is made."""
+    """A miniature is reproducible, whatever other miniatures are made."""
     sequence, *files, _ = CASES[kind]
     if kind == "zju_mocap":
         make_miniature(zju_mocap, tmp_path / "root", ["386"], 112, seed=3, frames=1)

@@ -1,5 +1,5 @@
-"""Broken sequences of ZJU-MoCap and HuMMan-Recon: each case gets one line that says where,
-what was expected and what was found.
+"""Broken sequences of ZJU-MoCap and HuMMan-Recon: each defect raises one line with its place, what was
+expected and what was found.
 
 The lines are listed in ``docs/evidence/broken_files.md``.
 """
@@ -35,7 +35,7 @@ HUMMAN_IMAGE, HUMMAN_MASK = (f"kinect_{kind}/kinect_000/000000.png" for kind in 
 
 
 def annotated(change):
-    """A case that changes what is in ``annots.npy``."""
+    """A case that changes the content of ``annots.npy``."""
 
     def apply(folder: Path) -> None:
         content = load_npy(folder / "annots.npy")
@@ -46,7 +46,7 @@ def annotated(change):
 
 
 def put_lens(kind: str, value):
-    """A case that gives the fourth camera another K, R, T or D."""
+    """A case that replaces K, R, T or D of the fourth camera."""
     return annotated(lambda content: content["cams"][kind].__setitem__(3, value))
 
 
@@ -68,7 +68,7 @@ def body(value):
 
 
 def calibrated(change):
-    """A case that changes what is in ``cameras.json``."""
+    """A case that changes the content of ``cameras.json``."""
 
     def apply(folder: Path) -> None:
         content = json.loads((folder / "cameras.json").read_text())
@@ -79,7 +79,7 @@ def calibrated(change):
 
 
 def put_kinect(key: str, value):
-    """A case that gives the fourth colour camera another K, R or T."""
+    """A case that replaces K, R or T of the fourth colour camera."""
     return calibrated(lambda content: content["kinect_color_003"].__setitem__(key, value))
 
 
@@ -99,7 +99,7 @@ def renumber(folder: Path) -> None:
 
 
 def of_photographs(image: str, masks: list[str], size: str, shrunk: str) -> dict:
-    """Broken photographs and masks of any sequence; the first mask is the one that is broken."""
+    """Cases of broken images and masks of any sequence; the first mask is broken."""
     name, mask = Path(image).name, masks[0]
     resized = f"{name}: expected a photograph of the calibration's size, .*; found {shrunk}"
     return {
@@ -253,7 +253,7 @@ IDS = [f"zju_mocap {name}" for name in ZJU_MOCAP] + [f"humman {name}" for name i
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> dict[str, Path]:
-    """Folders of a miniature of one frame for each data set."""
+    """Folder of a miniature with one frame for each data set."""
     roots = {name: tmp_path_factory.mktemp(name) / "data" for name in NAMES}
     make_miniature(zju_mocap, roots["zju_mocap"], ["386"], 64, seed=3, frames=1)
     arguments = [NAMES["humman"]], {"train": 0, "val": 1}, 128
@@ -262,7 +262,7 @@ def whole(tmp_path_factory) -> dict[str, Path]:
 
 
 def read_all(kind: str, root: Path) -> list:
-    """What training or evaluation reads of the frame."""
+    """Read everything of the frame that training or evaluation reads."""
     settings = ("train", ("data.size=64",)) if kind == "zju_mocap" else ("val", ())
     photographs = stored(build_data(kind, root, *settings[1]), settings[0])
     return [(name, photographs.view(name, 0), photographs.body(name)) for name in photographs.reader.subjects]
@@ -270,7 +270,7 @@ def read_all(kind: str, root: Path) -> list:
 
 @pytest.mark.parametrize(("kind", "size"), [("zju_mocap", (64, 64)), ("humman", (72, 128))])
 def test_the_whole_one_is_read(whole, kind, size):
-    """The intact miniature is read: the broken cases fail for their own reason."""
+    """The intact miniature can be read, so that broken ones fail for their own reason."""
     ((name, view, body),) = read_all(kind, whole[kind])
     assert name == f"{NAMES[kind]}_000000"
     assert view.image.shape == (*size, 3)
@@ -280,7 +280,7 @@ def test_the_whole_one_is_read(whole, kind, size):
 
 @pytest.mark.parametrize(("kind", "spoil", "line"), CASES, ids=IDS)
 def test_a_broken_one_gets_its_line(kind, spoil, line, whole, tmp_path, monkeypatch):
-    """Every defect is reported in one line that the documentation lists."""
+    """Each defect raises one line, which the documentation lists."""
     folder = shutil.copytree(whole[kind] / NAMES[kind], tmp_path / "data" / NAMES[kind])
     monkeypatch.chdir(tmp_path)
     spoil(folder)
@@ -317,7 +317,7 @@ def test_broken_parameters_get_their_line(case, tmp_path, monkeypatch):
 
 
 def test_missing_and_truncated_parameters_get_their_line(tmp_path):
-    """A missing or cut-off file is named."""
+    """A missing or truncated file is named."""
     path = tmp_path / "000000.npz"
     refused(r"000000.npz: expected SMPL parameters; found no such file", lambda: read_parameters(path))
     np.savez(path, **GOOD)
@@ -380,12 +380,12 @@ SETTINGS += [("humman", "val", *case) for case in HUMMAN_SETTINGS]
 
 @pytest.mark.parametrize(("kind", "phase", "override", "line"), SETTINGS)
 def test_impossible_settings_are_refused(whole, kind, phase, override, line):
-    """A wrong value fails at once and names its key."""
+    """A wrong value is rejected at once, with its key."""
     refused(line, lambda: build_data(kind, whole[kind], override).dataset.reader(phase))
 
 
 def test_without_smplx_the_message_says_what_to_install(whole, monkeypatch):
-    """A missing optional package is reported with how to get it."""
+    """A missing optional package is reported with the command to install it."""
     monkeypatch.setitem(sys.modules, "smplx", None)
     place = whole["humman"].with_name("data_body_models")
     data = build_data("humman", whole["humman"], f"data.smpl_model={place}").dataset

@@ -1,4 +1,4 @@
-"""Images of data sets and captures: formats, profiles, EXIF; files that look sound and are not."""
+"""Images of data sets and captures: formats, colour profiles, EXIF, and files with hidden defects."""
 
 import dataclasses
 import warnings
@@ -24,7 +24,7 @@ read = pytest.mark.parametrize("reader", READERS.values(), ids=READERS.keys())
 
 @pytest.fixture
 def pixels():
-    """[16, 16, 3] uint8, colours that are inside sRGB in all profiles of the tests."""
+    """[16, 16, 3] uint8, colours that stay inside sRGB for all profiles of the tests."""
     return np.random.default_rng(0).integers(90, 200, (16, 16, 3), np.uint8)
 
 
@@ -48,14 +48,14 @@ def test_the_colours_of_a_profile_are_those_of_its_formula(
     options = {"lossless": True} if suffix == "webp" else {}
     Image.fromarray(pixels).save(path, icc_profile=profile(primaries, gamma), **options)
     expected = in_srgb(pixels, primaries, gamma)
-    assert np.abs(expected - pixels).max() > 10  # the profile matters
-    # LittleCMS rounds light to 15 bits before the curve, and the result to 8 bits.
+    assert np.abs(expected - pixels).max() > 10  # the profile has an effect
+    # LittleCMS rounds linear light to 15 bits before the curve, and the result to 8 bits.
     assert np.abs(reader(path) - expected).max() <= 1.5
 
 
 @read
 def test_a_profile_of_srgb_changes_no_bit(tmp_path, reader):
-    """Most cameras embed one; what models were trained on must stay what it is."""
+    """Most cameras embed an sRGB profile, and data that models were trained on must not change."""
     pixels = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=profile(SRGB, None))
     assert np.array_equal(reader(tmp_path / "a.png"), pixels)
@@ -72,7 +72,7 @@ def test_profiles_of_grey_of_palettes_and_beside_alpha(tmp_path, pixels, reader)
 
 
 def test_alpha_and_masks_have_no_colours(tmp_path, pixels):
-    """A profile says what colours mean, not how much of a pixel the subject covers."""
+    """Profiles apply to colours, not to mattes and masks."""
     alpha = pixels[..., 0]
     options = {"icc_profile": profile(None, 1.0)}
     Image.fromarray(np.dstack((pixels, alpha))).save(tmp_path / "a.png", icc_profile=profile(SRGB, 1.0))
@@ -108,8 +108,7 @@ def orientation(value):
 @read
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_an_orientation_that_is_none_is_as_stored(tmp_path, pixels, reader, suffix):
-    """0 is how several programs say "unknown";
-    viewers and OpenCV show such photographs as stored."""
+    """Several programs write 0 for "unknown", and viewers and OpenCV show such images as stored."""
     for value in (0, 9, 255):
         path = with_exif(tmp_path / f"a.{suffix}", pixels, orientation(value))
         Image.fromarray(pixels).save(tmp_path / f"b.{suffix}")
@@ -132,7 +131,7 @@ def test_damaged_exif_is_named_and_as_stored(tmp_path, pixels, reader, suffix):
 
 @pytest.fixture
 def no_ghostscript(monkeypatch):
-    """Fail where Pillow starts Ghostscript."""
+    """Fail if Pillow starts Ghostscript."""
 
     def start(*arguments, **options):
         raise AssertionError("Ghostscript was started")
@@ -147,7 +146,7 @@ def write_eps(path):
 @pytest.mark.usefixtures("no_ghostscript")
 @pytest.mark.parametrize("reader", [*READERS.values(), read_image, lambda path: read_map(path, (4, 4))])
 def test_a_program_of_the_system_is_never_started(tmp_path, reader):
-    """A name says nothing about content: Pillow gives PostScript to Ghostscript, which runs it."""
+    """The format follows from content, not from the name: Pillow would run PostScript in Ghostscript."""
     write_eps(tmp_path / "a.png")
     with pytest.raises(InputError, match=r"a\.png: expected a readable image; found cannot identify"):
         reader(tmp_path / "a.png")
@@ -155,7 +154,7 @@ def test_a_program_of_the_system_is_never_started(tmp_path, reader):
 
 @pytest.mark.usefixtures("no_ghostscript")
 def test_textures_are_opened_by_the_same_list(tmp_path):
-    """trimesh opens the files that a material names."""
+    """The formats are limited also where trimesh opens the textures of a material."""
     folder = write_obj_scan(tmp_path, "a").parent
     texture = next(path for path in folder.iterdir() if path.suffix in (".jpeg", ".jpg", ".png"))
     write_eps(texture)
@@ -180,7 +179,7 @@ SOUND = View(
 
 
 class OneView(Reader):
-    """A reader of one's own that gives ``view`` and ``body``."""
+    """Custom reader that returns ``view`` and ``body``."""
 
     def __init__(self, view: View, body: np.ndarray | None = None) -> None:
         super().__init__()
@@ -201,7 +200,7 @@ class OneView(Reader):
     [(np.full((4, 4), 40000, np.uint16), "I;16"), (np.full((4, 4), np.nan, np.float32), "F")],
 )
 def test_photographs_of_other_depths_are_refused(tmp_path, array, mode):
-    """16-bit PNG and float TIFF, which Pillow converts to white or black without a word."""
+    """16-bit and float images are rejected, as Pillow would silently convert them to white or black."""
     path = tmp_path / "0.tiff"
     Image.fromarray(array).save(path)
     refused(
@@ -211,7 +210,7 @@ def test_photographs_of_other_depths_are_refused(tmp_path, array, mode):
 
 
 def test_photographs_that_are_to_be_turned_are_refused(tmp_path):
-    """A camera's EXIF orientation: masks and cameras fit either the stored or the shown pixels."""
+    """Images rotated by EXIF are rejected, as masks and cameras could fit the stored or the shown pixels."""
     exif = Image.Exif()
     for turn in (1, 6):
         exif[ExifTags.Base.Orientation] = turn
@@ -223,7 +222,7 @@ def test_photographs_that_are_to_be_turned_are_refused(tmp_path):
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK"])
 def test_photographs_of_eight_bits_are_read(tmp_path, mode):
-    """Grey, palette and colour photographs keep their values."""
+    """Grey, palette and colour images keep their values."""
     path = tmp_path / "0.tiff"
     Image.fromarray(np.full((4, 6, 3), 255, np.uint8)).convert(mode).save(path)
     image = read_photograph(path)
@@ -232,7 +231,7 @@ def test_photographs_of_eight_bits_are_read(tmp_path, mode):
 
 
 def test_maps_of_floats_are_refused(tmp_path):
-    """A mask or depth map of floats may hold NaN, and its units are not known."""
+    """A mask or depth map of floats could contain NaN, and its unit is unknown."""
     path = tmp_path / "mask.tiff"
     Image.fromarray(np.full((4, 4), np.nan, np.float32)).save(path)
     refused(r"mask\.tiff: expected whole numbers; found float32", lambda: read_map(path, (4, 4)))
@@ -260,7 +259,7 @@ def transposed(pose: np.ndarray) -> np.ndarray:
     ],
 )
 def test_wrong_cameras_are_refused(check, matrix, line):
-    """Transposed poses, matrices that are scaled as a whole, and rotations that are none."""
+    """Transposed poses, matrices scaled as a whole, and improper rotations are rejected."""
     refused(f"camera: expected (the )?{line}", lambda: check("camera", matrix))
 
 
@@ -276,14 +275,14 @@ def test_wrong_cameras_are_refused(check, matrix, line):
     ],
 )  # fmt: skip
 def test_what_a_reader_gives_is_checked(changes, line):
-    """A reader of one's own that returns other types, sizes or cameras is stopped on the host."""
+    """Wrong types, sizes or cameras of a custom reader are rejected on the host."""
     view = dataclasses.replace(SOUND, **changes)
     assert Photographs(OneView(SOUND)).view("a", 0) is SOUND
     refused(rf"^a/0\.png: {line}", lambda: Photographs(OneView(view)).view("a", 0))
 
 
 def test_bodies_with_nan_are_refused():
-    """One NaN vertex would make the whole Chamfer loss NaN."""
+    """A single NaN vertex would make the whole Chamfer loss NaN."""
     body = np.zeros((5, 3), np.float32)
     body[2, 1] = np.nan
     refused("a: body: expected finite numbers", lambda: Photographs(OneView(SOUND, body)).body("a"))
@@ -291,6 +290,6 @@ def test_bodies_with_nan_are_refused():
 
 @pytest.mark.parametrize("number", [10**400, float("inf"), float("nan"), "inf", None, True + 0j])
 def test_numbers_that_no_camera_has(number):
-    """JSON allows 400 digits and Infinity; NumPy converts the first with an error of its own."""
+    """JSON allows 400 digits and Infinity; for the first NumPy would raise another error."""
     intrinsics = [[5, 0, 3], [0, number, 2], [0, 0, 1]]
     refused("cam: expected (an array 3x3|finite numbers); found", lambda: check_intrinsics("cam", intrinsics))

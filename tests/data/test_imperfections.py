@@ -1,4 +1,4 @@
-"""Imperfections of captures: their limits, measured in stops and in pixels by other means."""
+"""Imperfections of captures: their limits in stops and pixels, measured independently."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from ghgs_people.rig import Rig
 
 
 def figure(height=96, width=72) -> np.ndarray:
-    """A body with outstretched arms."""
+    """Mask of a body with outstretched arms."""
     mask = np.zeros((height, width), bool)
     mask[10:85, 28:44] = True
     mask[25:33, 8:64] = True
@@ -26,7 +26,8 @@ def disc(radius: float) -> np.ndarray:
 
 
 def test_gains_stay_within_their_stops_and_change_nothing_on_average():
-    """A stop doubles the light; stored values are light to the power 1/2.2."""
+    """Deviations stay within their limits in stops (a stop doubles the light, and stored values are light to
+    the power 1/2.2), with a mean of 0."""
     largest = np.zeros(3)
     for seed in range(40):
         gains = draw_color_gains(4, 0.5, 0.2, np.random.default_rng(seed))
@@ -40,7 +41,7 @@ def test_gains_stay_within_their_stops_and_change_nothing_on_average():
 
 
 def test_masks_grow_shrink_and_fray_within_their_pixels():
-    """Nothing farther from the outline than the limits changes, and up to there it does."""
+    """Masks change up to the limit from the outline, but not beyond."""
     mask = figure()
     most = {"grown": 0, "shrunk": 0}
     both = 0
@@ -62,8 +63,7 @@ def test_masks_grow_shrink_and_fray_within_their_pixels():
 
 @pytest.mark.parametrize("size", [(60, 45), (31, 50)])
 def test_backgrounds_are_patches_that_scipy_enlarges(size):
-    """The same random numbers by another interpolation:
-    patterns agree to the rounding of float32."""
+    """Patterns equal those of SciPy's interpolation from the same random numbers, within float32 rounding."""
     found = draw_backgrounds(2, *size, np.random.default_rng(4))
     rng = np.random.default_rng(4)
     expected = 0.5 + rng.uniform(-0.2, 0.2, (2, 3, 1, 1)) + 0.02 * rng.standard_normal((2, 3, *size))
@@ -74,7 +74,7 @@ def test_backgrounds_are_patches_that_scipy_enlarges(size):
 
 
 def test_a_missing_piece_is_round_and_not_larger_than_its_share():
-    """What is missing fits into a circle; the chance decides how often, 0 never."""
+    """The missing piece fits into a circle of the limit's diameter and occurs with the given probability."""
     mask, missing = figure(), 0
     for seed in range(60):
         found = perturb_mask(mask, 0, 0, 0.2, 0.5, np.random.default_rng(seed))
@@ -90,13 +90,13 @@ def test_a_missing_piece_is_round_and_not_larger_than_its_share():
 
 @pytest.mark.parametrize("mask", [np.eye(1, 30, 7, bool).repeat(20, 0), np.ones((14, 28), bool)])
 def test_no_mask_is_emptied(mask):
-    """A line one pixel wide, and a subject that fills the photograph."""
+    """Neither a line one pixel wide nor a subject that fills the image becomes empty."""
     for seed in range(20):
         assert perturb_mask(mask, 4, 4, 3.0, 1.0, np.random.default_rng(seed)).any()
 
 
 def ring(shift=0.0, dtype=torch.float64) -> tuple[Cameras, torch.Tensor, torch.Tensor]:
-    """Four cameras, their masks of an ellipsoid, and points [n, 3] on it."""
+    """Four cameras, their masks of an ellipsoid, and points [n, 3] on its surface."""
     cameras = Rig().cameras(np.array([10.0, 80.0, 150.0, 290.0]), 96, 72)
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, 3)))
     points = directions / directions.norm(dim=-1, keepdim=True) * torch.tensor([0.3, 0.85, 0.25])
@@ -107,13 +107,13 @@ def ring(shift=0.0, dtype=torch.float64) -> tuple[Cameras, torch.Tensor, torch.T
         columns, rows = pixels.floor().long().unbind(-1)
         masks[v, rows, columns] = True
     extrinsics = cameras.extrinsics.to(dtype).clone()
-    # the world's origin moves by (s, s, s)
+    # Move the world's origin by (s, s, s).
     extrinsics[:, :3, 3] -= shift * extrinsics[:, :3, :3].sum(-1)
     return Cameras(cameras.intrinsics.to(dtype), extrinsics, 96, 72), masks, points + shift
 
 
 def moved_by(found: Cameras, cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
-    """Root mean square [V] in pixels that points move by."""
+    """Root mean square motion [V] of points in pixels."""
     pixels = [
         [project(points, c.intrinsics[v].double(), c.extrinsics[v].double())[0] for v in range(4)]
         for c in (found, cameras)
@@ -123,7 +123,7 @@ def moved_by(found: Cameras, cameras: Cameras, points: torch.Tensor) -> torch.Te
 
 @pytest.mark.parametrize("limit", [1.0, 3.0])
 def test_calibration_errors_move_the_subject_by_their_pixels(limit):
-    """Points of the surface move by up to the limit in each photograph; cameras stay cameras."""
+    """Points of the surface move by up to the limit in each image, and rotations stay proper."""
     cameras, masks, points = ring()
     errors = []
     for seed in range(25):
@@ -133,14 +133,14 @@ def test_calibration_errors_move_the_subject_by_their_pixels(limit):
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(4, 3, 3))
         assert (found.intrinsics[:, :2, 2] == cameras.intrinsics[:, :2, 2]).all()
     errors = torch.cat(errors) / limit
-    assert errors.max() < 1.15  # the corners of the box, not the surface, have the error exactly
+    assert errors.max() < 1.15  # the limit holds exactly for the corners of the box, not for the surface
     assert errors.max() > 0.7
     assert 0.3 < errors.mean() < 0.6
 
 
 def test_calibration_errors_have_nothing_in_common():
-    """Photographs do not tell where a rig is, nor its scale:
-    what all cameras share cannot be undone."""
+    """Errors common to all cameras are removed, as images determine neither the place nor the scale of a
+    rig."""
     cameras, masks, _ = ring()
     true = cameras.extrinsics
     middle = torch.tensor([0, 0.9, 0]).double()
@@ -160,8 +160,7 @@ def test_calibration_errors_have_nothing_in_common():
 
 
 def test_calibration_errors_do_not_depend_on_the_worlds_origin():
-    """A world whose origin is a kilometre away has the same errors,
-    up to the rounding of rotations."""
+    """Errors are the same if the world's origin is a kilometre away, up to the rounding of rotations."""
     results = []
     for shift in (0.0, 1000.0):
         cameras, masks, points = ring(shift)
@@ -171,7 +170,7 @@ def test_calibration_errors_do_not_depend_on_the_worlds_origin():
 
 
 def test_a_photograph_without_the_subject_is_no_obstacle():
-    """Small sizes may lose a mask: it stays empty, and its camera has an error like others."""
+    """An empty mask, as small sizes can cause, stays empty, and its camera gets an error like the others."""
     cameras, masks, points = ring()
     masks[1] = False
     found = perturb_cameras(cameras, masks, 2.0, np.random.default_rng(0))
@@ -180,7 +179,7 @@ def test_a_photograph_without_the_subject_is_no_obstacle():
 
 
 def test_cameras_that_look_away_from_one_another_are_refused():
-    """There is no subject whose points could move by pixels."""
+    """Cameras that do not look at a common subject are rejected, as an error in pixels is undefined."""
     cameras, masks, _ = ring()
     turned = cameras.extrinsics.clone()
     turned[:, [0, 2]] *= -1  # by half a turn

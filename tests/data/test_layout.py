@@ -1,5 +1,5 @@
-"""The rendered layout: what is written is read back, others' variants too,
-and bad files are named."""
+"""The rendered layout: files written are read back, variants of other renderers are read, and bad files
+are named."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ SIZE = 56
 
 
 def write_person(root, name="box", size=SIZE, positions=(0, 4)) -> dict:
-    """Photographs of a box, written below ``root/train``; what went in, by position."""
+    """Write images of a box below ``root/train``; returns the images and cameras by position."""
     person = RIG.place(box_person(name), subject_rng(0, name))
     studio = Studio(person, None)
     written = {}
@@ -46,7 +46,7 @@ def photographs(root, size=None, cache_mb=0, **options) -> Photographs:
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """The folder of a box, and what it was made of."""
+    """The folder of a box, and the images and cameras written to it."""
     folder = tmp_path_factory.mktemp("box")
     return folder, write_person(folder)
 
@@ -57,7 +57,7 @@ def root(box, tmp_path):
 
 
 def on_box(view: View, person) -> np.ndarray:
-    """Distance of unprojected depth to the surface of the box."""
+    """Distances of unprojected depths from the surface of the box."""
     points = points_of(view)[view.mask & (view.depth > 0)]
     low, high = person.parts[0].vertices.min(0), person.parts[0].vertices.max(0)
     outside = np.maximum(np.maximum(low - points, points - high), 0)
@@ -66,7 +66,7 @@ def on_box(view: View, person) -> np.ndarray:
 
 
 def test_names_of_other_systems(tmp_path):
-    """Folders and files that Windows or macOS renamed, all of them, hold what they held."""
+    """Folders and files with names as changed by Windows or macOS are read as before."""
     write_person(tmp_path, "K\u00e4the")
     right = photographs(tmp_path).view("K\u00e4the", 4, 0)
     for path in sorted(tmp_path.rglob("*"), key=lambda path: -len(path.parts)):
@@ -82,7 +82,7 @@ def test_names_of_other_systems(tmp_path):
 
 
 def test_round_trip(box):
-    """What is written is read back: pixels, masks, depth, cameras and body."""
+    """Pixels, masks, depths, cameras and body are read back as written."""
     folder, written = box
     layout = photographs(folder)
     assert layout.reader.subjects == {"box": (0, 4)}
@@ -92,7 +92,7 @@ def test_round_trip(box):
         view = layout.view("box", position, 0)
         assert np.abs(view.image / 255 - shots.images[0]).max() < 0.06
         np.testing.assert_array_equal(view.mask, shots.masks[0])
-        # The authors' loader takes channel 0 of three.
+        # The authors' loader reads channel 0 of three.
         stored = np.asarray(Image.open(folder / f"train/mask/box_{position:03d}/0.png"))
         np.testing.assert_array_equal(stored, np.stack([shots.masks[0] * np.uint8(255)] * 3, -1))
         np.testing.assert_allclose(view.alpha, shots.alphas[0], atol=0.5 / 255 + 1e-6)
@@ -104,7 +104,7 @@ def test_round_trip(box):
 
 
 def test_depth_code_is_inverse_and_keeps_zero():
-    """The 16-bit code is 2^15 / metres, saturates, and keeps 0 for unknown."""
+    """Inverse depth is 2^15 / metres in 16 bits, saturates, and keeps 0 for unknown."""
     depth = np.array([0.0, 0.25, 1.0, 2.0, 3.0], np.float32)
     code = encode_depth(depth)
     assert code.tolist() == [0, 65535, 32768, 16384, 10923]
@@ -112,24 +112,23 @@ def test_depth_code_is_inverse_and_keeps_zero():
 
 @pytest.mark.parametrize("size", [(28, 28), (28, 42), (112, 84), (30, 21)])
 def test_resized_views_keep_their_geometry(root, size):
-    """Unprojected depth of a resized view still lies on the mesh:
-    intrinsics follow pixels exactly."""
+    """Unprojected depths of a resized view still lie on the mesh, and intrinsics scale exactly."""
     view = photographs(root, size).view("box", 0, 0)
     assert view.image.shape == (*size, 3)
     assert view.mask.shape == view.depth.shape == size
     person = RIG.place(box_person(), subject_rng(0, "box"))
-    # Nearest depth is off by at most half a source pixel, 2 cm, along a surface.
+    # Depth can be off by at most half a source pixel, 2 cm, along a surface.
     assert np.quantile(on_box(view, person), 0.9) < 0.015
     scale = np.array([size[1] / SIZE, size[0] / SIZE, 1])
     original = photographs(root).view("box", 0, 0)
     np.testing.assert_allclose(view.intrinsics, original.intrinsics * scale[:, None], rtol=1e-6)
-    # A larger camera of the same rig is the same camera.
+    # Equal to the rig's camera resized to this size.
     camera = RIG.cameras(np.zeros(1), SIZE, SIZE).resized(*size)
     np.testing.assert_allclose(view.intrinsics, camera.intrinsics[0], rtol=1e-5)
 
 
 def test_renders_of_others_are_read(root):
-    """PNG photographs, masks of three channels with 0/1, no depth, smplx only, 4 x 4 poses,
+    """Variants are read: PNG images, masks with three channels of 0/1, no depth, only smplx, 4 x 4 poses,
     hr images."""
     ours = photographs(root, pixel_centers="half").view("box", 0, 0)
     img, mask, depth, parm = (root / "train" / k / "box_000" for k in ("img", "mask", "depth", "parm"))
@@ -157,14 +156,14 @@ def test_renders_of_others_are_read(root):
 
 @pytest.mark.parametrize("size", [(28, 28), (30, 21)])
 def test_mattes_are_resized_as_photographs_and_masks_follow(root, size):
-    """The share of the subject stays; masks are where it fills a half,
-    depths where it shows at all."""
+    """Resizing keeps the mean matte; masks are true where it is at least half, and depths known only where
+    it is above 0."""
     full, small = photographs(root).view("box", 0, 0), photographs(root, size).view("box", 0, 0)
     assert small.alpha.mean() == pytest.approx(full.alpha.mean(), abs=1e-3)
     np.testing.assert_array_equal(small.mask, small.matte >= 128)
     assert not small.depth[small.matte == 0].any()
     assert (small.depth[small.mask] > 0).all()
-    # The colour of the box is known where the image is divided by its matte.
+    # Divided by its matte, the rim has the colour of the box.
     rim = (small.matte > 64) & (small.matte < 255)
     own, color = small.image[rim].astype(float), small.image[small.matte == 255].mean(0)
     assert len(own) > 20
@@ -173,7 +172,7 @@ def test_mattes_are_resized_as_photographs_and_masks_follow(root, size):
 
 
 def test_data_without_mattes_is_read_as_before(root):
-    """The matte is optional: mask, image and depth of the subject are the same without it."""
+    """Without the optional matte, the subject's mask, image and depth are the same."""
     soft = photographs(root).view("box", 0, 0)
     shutil.rmtree(root / "train" / "alpha")
     plain = photographs(root).view("box", 0, 0)
@@ -195,7 +194,7 @@ def test_cache_keeps_what_fits_and_no_more(root):
     first = layout.view("box", 0, 0)
     assert layout.view("box", 0, 0) is first
     layout.view("box", 4, 0)
-    layout.body("box")  # the third thing: the oldest goes
+    layout.body("box")  # a third entry: the oldest one is dropped
     assert layout.view("box", 0, 0) is not first
     assert layout.cached_bytes <= layout.cache_bytes
     nothing = photographs(root)
@@ -203,12 +202,12 @@ def test_cache_keeps_what_fits_and_no_more(root):
 
 
 def picture(kind: str, array, suffix: str = "png"):
-    """A damage: another picture of a kind."""
+    """A damage that replaces an image of a kind."""
     return lambda train: Image.fromarray(array).save(train / kind / f"box_000/0.{suffix}")
 
 
 def camera(kind: str, change):
-    """A damage: ``change`` of a matrix."""
+    """A damage that applies ``change`` to a matrix."""
 
     def apply(train):
         path = train / "parm" / "box_000" / f"0_{kind}.npy"
@@ -262,7 +261,7 @@ DAMAGES = [
 
 @pytest.mark.parametrize(("damage", "line"), DAMAGES)
 def test_bad_files_are_named(root, damage, line):
-    """Every defect of a file is reported in one line with its path."""
+    """Each defect of a file raises one line with its path."""
     damage(root / "train")
     refused(line, lambda: photographs(root).view("box", 0, 0))
 
@@ -298,7 +297,7 @@ def test_missing_roots_and_phases(tmp_path, folder, names, line):
 
 
 def test_a_half_rendered_subject_is_refused(root):
-    """Where this package renders, a subject without its mark is not whole."""
+    """In data rendered by this package, a subject without its marker is incomplete."""
     (root / "rendering" / "done" / "train").mkdir(parents=True)
     line = r"expected 1 whole subjects; found 0 \(box is missing or half-rend"
     refused(line, lambda: Layout(root, "train"))
@@ -310,8 +309,8 @@ def test_a_half_rendered_subject_is_refused(root):
 
 
 def test_a_mask_is_where_it_is_above_half_of_its_maximum(root):
-    """Compression leaves small values beside the subject, and others than the largest on it; masks
-    may have one channel."""
+    """The threshold tolerates compression, with small values outside the subject and various values on it,
+    and masks with one channel."""
     path = root / "train" / "mask" / "box_000" / "0.png"
     mask = np.asarray(Image.open(path))[..., 0] > 0
     noise = np.random.default_rng(0).integers(0, 30, mask.shape)

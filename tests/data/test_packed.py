@@ -1,4 +1,4 @@
-"""Packed photographs: samples are those of the data's own files, whatever happens to either."""
+"""Packed files: samples equal those of the original files, whatever happens to either."""
 
 import logging
 import multiprocessing
@@ -19,7 +19,7 @@ SIZES = {"sizes": [28, [42, 28]], "target_scale": [0.7, 1.0]}
 
 @pytest.fixture(scope="module")
 def boxes(tmp_path_factory) -> Path:
-    """Two people of training and one of validation."""
+    """Rendered boxes: two subjects for training and one for validation."""
     folder = tmp_path_factory.mktemp("boxes")
     render_boxes(folder / "out", folder / "scans", train=2, val=1)
     return folder / "out"
@@ -27,12 +27,12 @@ def boxes(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def root(boxes, tmp_path) -> Path:
-    """A copy that a test may change."""
+    """A copy of the data that a test may change."""
     return shutil.copytree(boxes, tmp_path / "out")
 
 
 def batches(root, gb=1, **options):
-    """The first steps of a training."""
+    """Batches of the first steps of a training."""
     data = rendered(root, packed_gb=gb, **{"steps_per_epoch": 4, "batch_size": 2, "workers": 0, **options})
     return list(data.train_dataloader())
 
@@ -42,7 +42,7 @@ def files(root) -> list[Path]:
 
 
 def same(root, **options) -> bool:
-    """Whether steps from packed files are, to the bit, those from the data's own."""
+    """Whether batches from packed files equal those from the original files, bit for bit."""
     return all(map(equal, batches(root, **options), batches(root, gb=0, **options)))
 
 
@@ -59,8 +59,8 @@ def same(root, **options) -> bool:
     ids=str,
 )
 def test_samples_are_those_of_the_folder(root, options):
-    """Photographs, masks, mattes, depths, bodies and cameras;
-    resized once, in each step, or not at all."""
+    """Images, masks, mattes, depths, bodies and cameras are equal, whether resized once, in each step or
+    never."""
     assert same(root, **options)
     assert files(root)
     first = batches(root, **options)[0]
@@ -69,7 +69,7 @@ def test_samples_are_those_of_the_folder(root, options):
 
 
 def test_samples_come_from_the_packed_files(root):
-    """Once they are there no photograph is decoded."""
+    """Once packed files exist, no image is decoded."""
     expected = batches(root)
     times = [path.stat().st_mtime_ns for path in files(root)]
 
@@ -86,7 +86,8 @@ def test_samples_come_from_the_packed_files(root):
 
 @pytest.mark.parametrize("kind", ["img", "alpha", "depth", "parm", "smpl"])
 def test_changed_data_is_never_read_from_an_old_file(root, kind):
-    """Not even where size and time of files stay: their last change has another time."""
+    """Changes are detected even if size and modification time stay equal, by the time of the status
+    change."""
     before = batches(root)
     for path in (root / "train" / kind).glob("*/*"):
         stat = path.stat()
@@ -101,11 +102,11 @@ def test_changed_data_is_never_read_from_an_old_file(root, kind):
     after = batches(root)
     assert all(map(equal, after, batches(root, gb=0)))
     assert not any(map(equal, after, before))
-    assert len(files(root)) == 2  # the old ones are gone
+    assert len(files(root)) == 2  # outdated files were deleted
 
 
 def test_an_interrupted_or_torn_file_is_written_again(root):
-    """What a killed process or a full disk has left is no data."""
+    """Files that a killed process or a full disk has left are written again."""
     batches(root)
     packed._open.cache_clear()
     for path in files(root):
@@ -123,7 +124,7 @@ def _read(root, go_on):
 
 
 def test_many_processes_at_once(root):
-    """Each reads what is right, whoever has written it."""
+    """All processes read correct samples, whichever has written the files."""
     context = multiprocessing.get_context("fork")
     go_on = context.Barrier(3)
     readers = [context.Process(target=_read, args=(root, go_on)) for _ in range(3)]
@@ -136,7 +137,7 @@ def test_many_processes_at_once(root):
 
 
 def test_a_broken_photograph_is_named_when_it_is_drawn(root):
-    """It is left out of the file; the others are packed."""
+    """A broken image is not packed, and raises its error when it is sampled; the others are packed."""
     path = root / "train" / "img" / "s0_000" / "0.jpg"
     path.write_bytes(b"no image")
     reader = rendered(root).dataset.reader("train")
@@ -161,16 +162,15 @@ def test_packing_can_be_switched_off(root):
 
 
 def test_what_would_not_fit_is_not_packed(root, caplog):
-    """More than packed_gb, or than half of the free disk: the data's own files are read,
-    and that is said."""
+    """Above packed_gb, or half of the free disk space, the original files are read, and a line is logged."""
     with caplog.at_level(logging.INFO):
         assert all(map(equal, batches(root, gb=1e-9), batches(root, gb=0)))
     assert "photographs are not packed: about" in caplog.text
-    assert len(files(root)) == 1  # of the first subject, by which the size is known
+    assert len(files(root)) == 1  # of the first subject, from which the size is estimated
 
 
 def test_a_full_disk_stops_no_training(root, caplog, monkeypatch):
-    """What cannot be written is read from the data's own files; it is said once."""
+    """If files cannot be written, the original ones are read, with a single warning."""
     batches(root)
     files(root)[1].unlink()
 
@@ -184,7 +184,7 @@ def test_a_full_disk_stops_no_training(root, caplog, monkeypatch):
 
 
 def test_data_that_cannot_be_written_to_is_packed_in_the_cache(root, tmp_path, monkeypatch):
-    """Two data sets have two folders there."""
+    """Each data set has its own folder in the cache."""
     monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(packed.os, "access", lambda path, mode: False)
     assert same(root)
@@ -194,7 +194,7 @@ def test_data_that_cannot_be_written_to_is_packed_in_the_cache(root, tmp_path, m
 
 
 def test_short_trainings_write_nothing(root):
-    """Where fewer photographs are read than would be packed; those that are there are read."""
+    """Nothing is packed if a run reads fewer images than the data set has."""
     from lightning import Trainer
 
     def steps(count):
@@ -202,7 +202,7 @@ def test_short_trainings_write_nothing(root):
         data.trainer = Trainer(max_steps=count, accelerator="cpu", logger=False, enable_checkpointing=False)
         return data.train_dataloader()
 
-    steps(20)  # of 5 photographs; there are 2 x 16 x 4
+    steps(20)  # of 5 images each; the data has 2 x 16 x 4
     assert not files(root)
     steps(30)
     assert files(root)

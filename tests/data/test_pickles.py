@@ -1,5 +1,5 @@
-"""Pickles of data sets: arrays and plain containers come through,
-anything else is refused unexecuted."""
+"""Pickles of data sets: arrays and plain containers are read, anything else is rejected without being
+called."""
 
 import collections
 import os
@@ -30,7 +30,7 @@ WHOLE = pickle.dumps(CONTENT)
 
 
 class Call:
-    """Unpickles to the call of something."""
+    """Object whose pickle calls a function when loaded."""
 
     def __init__(self, *call):
         self.call = call
@@ -47,7 +47,7 @@ def equal(a, b) -> bool:
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_arrays_and_containers_come_through(tmp_path, protocol):
-    """Everything that data sets store is read, in every pickle protocol."""
+    """Everything that data sets contain is read, in each pickle protocol."""
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps(CONTENT, protocol=protocol))
     found = load_pickle(path)
@@ -68,16 +68,16 @@ def test_names_of_both_numpys(tmp_path, core):
 
 
 def test_python_2s_strings_and_builtins(tmp_path):
-    """Files written by Python 2, as ZJU-MoCap's, are read."""
+    """Files written by Python 2, such as ZJU-MoCap's, are read."""
     path = tmp_path / "a.pkl"
-    # As cPickle.dump({'poses': set([1.0])}, protocol=2) of Python 2 wrote it.
+    # Written by cPickle.dump({'poses': set([1.0])}, protocol=2) of Python 2.
     path.write_bytes(b"\x80\x02}U\x05posesc__builtin__\nset\n]G?\xf0\x00\x00\x00\x00\x00\x00a\x85Rs.")
     assert load_pickle(path) == {"poses": {1.0}}
 
 
 @pytest.mark.parametrize("module", ["trimesh.caching", "trimesh.util"])
 def test_trimeshs_arrays_are_arrays(tmp_path, module):
-    """THuman2.0's fits hold trimesh's array class, under either of its names."""
+    """THuman2.0's fits contain trimesh's array class, under either of its names."""
     path = tmp_path / "a.pkl"
     data = pickle.dumps({"translation": np.ones(3, np.float32).view(TrackedArray)}, protocol=2)
     assert b"trimesh.caching\nTrackedArray" in data
@@ -99,7 +99,7 @@ def test_trimeshs_arrays_are_arrays(tmp_path, module):
 )
 @pytest.mark.parametrize("protocol", [0, 2, 5])
 def test_anything_else_is_refused_by_its_name_and_not_called(tmp_path, call, name, protocol):
-    """A malicious pickle runs nothing, whatever it names."""
+    """A malicious pickle runs no code, whatever names it contains."""
     mark = tmp_path / "called"
     function, *arguments = call
     bad = Call(function, *(a.format(path=mark) for a in arguments))
@@ -118,7 +118,7 @@ def test_anything_else_is_refused_by_its_name_and_not_called(tmp_path, call, nam
 
 
 def test_no_codec_but_the_one_that_bytes_need(tmp_path):
-    """The one admitted function cannot be used for other codecs."""
+    """The admitted function cannot be used for other codecs."""
     path = tmp_path / "a.pkl"
     # _codecs.encode('uryyb', 'rot13')
     path.write_bytes(b"\x80\x02c_codecs\nencode\nX\x05\x00\x00\x00uryybX\x05\x00\x00\x00rot13\x86R.")
@@ -151,7 +151,7 @@ def test_broken_files_are_named(tmp_path, load, data, line):
     ids=["array", "dictionary, as of ZJU-MoCap", "objects"],
 )
 def test_npy_files(tmp_path, content):
-    """Plain and pickled .npy files are read by the same rules."""
+    """Plain and pickled .npy files are read with the same restrictions."""
     np.save(tmp_path / "a.npy", content)
     assert equal(content, load_npy(tmp_path / "a.npy"))
 

@@ -1,4 +1,4 @@
-"""Resizing keeps everything at its place, or does what the authors' code does."""
+"""Resizing shifts nothing, or reproduces the authors' code."""
 
 from pathlib import Path
 
@@ -20,14 +20,14 @@ from ghgs_lit.errors import InputError
 from tests.helpers.people import render_boxes
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-# Of OpenCV 5.0 (nearest neighbour) and Pillow 13.0 (bicubic).
+# Recorded from OpenCV 5.0 (nearest neighbour) and Pillow 13.0 (bicubic).
 RECORDED = dict(np.load(FIXTURES / "release_loading.npz"))
-# 2:1, 7.5:1, and ratios that fit neither way.
+# Ratios of 2:1 and 7.5:1, two odd ratios, and an enlargement.
 SIZES = [(96, 48), (150, 20), (96, 52), (97, 41), (40, 64)]
 
 
 def slow_means(image: np.ndarray, size: int) -> np.ndarray:
-    """Means over areas of a square image [n, n], float64, one new pixel after the other."""
+    """Reference in float64: means over the areas of new pixels of a square image [n, n]."""
     n = len(image)
     edges = np.arange(size + 1) * n / size
     weights = np.clip(
@@ -49,8 +49,7 @@ def middle(mask: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("size", ["half", "odd"])
 def test_release_resizes_as_opencv_and_pillow(size):
-    """The numbers of the libraries themselves: even pixels of masks,
-    Pillow's bicubic photographs."""
+    """Results equal those recorded from the libraries, for masks and images."""
     image, mask = RECORDED[f"photograph_bicubic_{size}"], RECORDED[f"mask_nearest_{size}"][..., 0]
     np.testing.assert_array_equal(release_image(RECORDED["photograph"], *image.shape[:2]), image)
     np.testing.assert_array_equal(release_mask(RECORDED["mask"][..., 0], *mask.shape), mask)
@@ -62,7 +61,7 @@ def test_release_resizes_as_opencv_and_pillow(size):
 
 @pytest.mark.parametrize(("old", "new"), [pair for pair in SIZES if pair[0] > pair[1]])
 def test_photographs_shrink_by_exact_areas(old, new):
-    """Every new pixel is the mean over its area, up to rounding to 8 bits; none is shifted."""
+    """Each new pixel is the mean over its area, up to rounding to 8 bits."""
     image = np.random.default_rng(0).integers(0, 256, (old, old, 3), dtype=np.uint8)
     expected = slow_means(image[..., 0], new)
     assert np.abs(area_image(image, new, new)[..., 0] - expected).max() <= 0.501
@@ -70,7 +69,7 @@ def test_photographs_shrink_by_exact_areas(old, new):
 
 @pytest.mark.parametrize(("old", "new"), SIZES)
 def test_masks_stay_at_their_place(old, new):
-    """The middle of a mask moves by less than a twentieth of a pixel on average, at any ratio."""
+    """The centre of a mask moves by less than 0.05 pixels on average, at any ratio."""
     rng = np.random.default_rng(1)
     moved, grown = [], []
     for _ in range(30):
@@ -87,8 +86,8 @@ def test_masks_stay_at_their_place(old, new):
 
 @pytest.mark.parametrize(("old", "new"), SIZES)
 def test_depth_is_that_of_the_new_centres(old, new):
-    """The depth of a slanted plane is exact to the rounding of the file;
-    a step keeps its two depths."""
+    """The depth of a slanted plane is exact within the rounding of the format, and a step keeps its two
+    depths."""
     rows, columns = np.mgrid[:old, :old] + 0.5
     inverse = np.round(12000 + 20 * rows - 15 * columns).astype(np.uint16)
     rows, columns = (np.mgrid[:new, :new] + 0.5) * old / new
@@ -102,7 +101,7 @@ def test_depth_is_that_of_the_new_centres(old, new):
 
 
 def test_a_resized_view_has_depth_in_its_mask_only():
-    """Mask and depth of a halved photograph agree: no depth beside the mask, none missing in it."""
+    """After halving, depths are known exactly where the mask is true."""
     mask = ellipse(96, np.random.default_rng(2))
     inverse = encode_depth(np.where(mask, 2.0, 0))
     view = View(np.zeros((96, 96, 3), np.uint8), mask, inverse, np.eye(3), np.eye(4))
@@ -112,8 +111,7 @@ def test_a_resized_view_has_depth_in_its_mask_only():
 
 
 def test_the_release_protocol_loads_as_the_release(tmp_path):
-    """experiment=thuman2 and data=thuman2_release read as the release does;
-    everything else by areas."""
+    """experiment=thuman2 and data=thuman2_release resize as the authors' code, others by areas."""
     render_boxes(tmp_path / "root", tmp_path / "scans", train=1, val=1)
     for override, resampling, centers in (
         ("experiment=thuman2", "release", "half"),

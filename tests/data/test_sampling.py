@@ -1,5 +1,5 @@
-"""Sampling protocols and the DataModules: angles, batches, refusals; what training draws: samples
-that resume, are fair, and follow the seed."""
+"""Sampling protocols and data modules: camera angles, batches, errors, and training samples that resume
+exactly, are fair and depend on the seed."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def module(boxes, **changes):
 
 
 def turns(cameras) -> np.ndarray:
-    """Yaw of cameras in degrees from their actual extrinsics."""
+    """Yaw of cameras in degrees, from their extrinsics."""
     center = cameras.centers.double().numpy()
     return np.degrees(np.arctan2(center[..., 0], center[..., 2]))
 
@@ -39,14 +39,13 @@ def between(a, b) -> np.ndarray:
 
 @pytest.mark.parametrize(("count", "positions"), [(3, [0, 5, 10]), (4, [0, 4, 8, 12]), (5, [0, 3, 6, 9, 12])])
 def test_even_positions_are_the_protocols(count, positions):
-    """The inputs of the published protocols for 3, 4 and 5 views."""
+    """Even positions equal those of the published protocols for 3, 4 and 5 views."""
     assert even_positions(16, count) == positions
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_uneven_views_stay_around_the_subject(count):
-    """Neighbours are a position or more apart;
-    no camera is further than one from where it is even."""
+    """Positions are distinct, and each is at most one position from even spacing."""
     protocol = ViewProtocol(training_counts=(count,), training="uneven")
     draws = [protocol.draw(FULL, count, 16, np.random.default_rng(seed)) for seed in range(80)]
     gaps = {tuple(np.diff([*positions, positions[0]]) % 16) for positions in draws}
@@ -56,7 +55,7 @@ def test_uneven_views_stay_around_the_subject(count):
 
 
 def test_uneven_views_need_room():
-    """Positions that are closer than 3 could meet."""
+    """Even positions less than 3 apart could coincide."""
     protocol = ViewProtocol(training_counts=(4,), training="uneven")
     with pytest.raises(InputError, match=r"views\.training: expected any or even for 4 views of 8 positions"):
         TrainingSampler({"a": tuple(range(8))}, protocol, TargetProtocol(name="release"), 8, 1, 0)
@@ -64,8 +63,8 @@ def test_uneven_views_need_room():
 
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_targets_stand_where_their_protocol_says(boxes, count):
-    """Angles of the actual cameras: 11.25 degrees beside the first input;
-    equally far from two inputs."""
+    """Targets of release are 11.25 degrees from the first input, and those of midway equally far from two
+    inputs, measured from the cameras."""
     data = module(boxes)
     for batch in data.evaluation_loader(count, TargetProtocol(name="release")):
         first, target = turns(batch.cameras)[:, 0], turns(batch.targets.cameras)[:, 0]
@@ -95,12 +94,12 @@ def test_targets_stand_where_their_protocol_says(boxes, count):
     [(0, 5, (2, 3)), (12, 0, (14, 0)), (10, 0, (13, 0)), (15, 0, (15, 3)), (15, 2, (0, 3))],
 )
 def test_middle_wraps_around_the_ring(first, second, photo):
-    """The middle of two positions is right across the end of the ring."""
+    """The middle is correct also across the end of the ring."""
     assert middle(first, second, 16) == photo
 
 
 def test_release_beside_every_input_and_listed_positions():
-    """per_subject=all measures beside every input; listed inputs replace the even ones."""
+    """per_subject=all gives a target next to every input, and listed inputs replace the even ones."""
     targets = TargetProtocol(name="release", per_subject="all")
     samples = evaluation_samples({"a": FULL}, 3, [targets], 16, 0, [[0, 6, 11]])
     assert samples[0].inputs == ((0, 0), (6, 0), (11, 0))
@@ -108,7 +107,7 @@ def test_release_beside_every_input_and_listed_positions():
 
 
 def test_random_targets_of_evaluation_are_fixed_and_differ_between_subjects():
-    """Evaluation measures the same targets every time."""
+    """Random targets are equal at each evaluation, and differ between subjects."""
     targets = TargetProtocol(name="random", per_subject=3)
     subjects = {f"s{i}": FULL for i in range(6)}
     first = evaluation_samples(subjects, 4, [targets], 16, 0)
@@ -120,7 +119,7 @@ def test_random_targets_of_evaluation_are_fixed_and_differ_between_subjects():
 
 
 def test_batches_have_the_shapes_and_values_they_promise(boxes):
-    """Shapes, types and value ranges of a batch; every vertex of a body counts."""
+    """Batches have the documented shapes, dtypes and ranges, and all vertices of a body."""
     data = module(boxes, targets={"name": "random", "per_step": 2}, target_size=[42, 35])
     batch = data.training_batch(0)
     assert batch.images.shape == (2, 4, 3, 28, 28)
@@ -134,17 +133,17 @@ def test_batches_have_the_shapes_and_values_they_promise(boxes):
     assert torch.equal(batch.depths > 0, batch.alpha > 0)
     assert torch.equal(batch.masks, batch.alpha > 0.5)
     assert ((batch.alpha > 0) & (batch.alpha < 1)).any()
-    # premultiplied; JPEG may add a little
+    # Premultiplied, with a tolerance for JPEG.
     assert (batch.images.amax(2) <= batch.alpha + 4 / 255).all()
     assert [len(v) for v in batch.views] == [4, 4]
-    # Antialiased rims stay: some light outside the mask.
+    # Antialiased rims are kept: some pixels outside the mask are not black.
     outside = batch.images.movedim(2, -1)[~batch.masks]
     assert outside.max() > 0.05
     assert torch.equal(data.training_batch(0).body_vertices[0], batch.body_vertices[0])
 
 
 def test_data_without_depth_or_body_says_none(boxes, tmp_path):
-    """Missing depths, bodies or mattes (of one photograph) become None, not zeros."""
+    """Missing depths, bodies or mattes, even of a single image, become None, not zeros."""
     import shutil
 
     shutil.copytree(boxes / "train", tmp_path / "train")
@@ -159,7 +158,7 @@ def test_data_without_depth_or_body_says_none(boxes, tmp_path):
 
 
 class Recorder(LightningModule):
-    """Trains one number and notes what it saw."""
+    """Module with a single weight that records its samples."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -194,7 +193,7 @@ def train(boxes, steps, checkpoint=None, folder=None, workers=0):
 
 @pytest.mark.filterwarnings("ignore")
 def test_training_resumes_with_the_very_next_draw(boxes, tmp_path):
-    """Stopped after 3 steps of an epoch of 4: the fourth is next, not the first again."""
+    """A run that stops after 3 steps of an epoch of 4 resumes with the fourth, not with the first."""
     whole = train(boxes, 10, folder=tmp_path / "a")
     assert len(set(map(str, whole))) == 10
     for done in (3, 9):
@@ -203,8 +202,7 @@ def test_training_resumes_with_the_very_next_draw(boxes, tmp_path):
 
 
 def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
-    """Lengths follow subjects, batch size, steps_per_epoch and limit;
-    evaluation repeats exactly."""
+    """Lengths depend on subjects, batch size, steps_per_epoch and limit; evaluation repeats exactly."""
     data = module(boxes)
     assert len(data.train_dataloader()) == 100  # 50 passes over 3 subjects, 2 at a time
     assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]
@@ -245,13 +243,13 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
     ],
 )
 def test_impossible_values_fail_at_once(boxes, changes, message):
-    """A wrong value or key fails when the configuration is read and is named."""
+    """A wrong value or key is rejected with its name when the configuration is read."""
     with pytest.raises(InputError, match=message):
         module(boxes, **changes)
 
 
 def test_fewer_views_than_asked(boxes, tmp_path):
-    """Too few cameras are refused with the subject's name; listed positions help."""
+    """Too few cameras raise with the subject's name, unless other positions are listed."""
     import shutil
 
     for kind in ("img", "mask", "parm", "depth"):
@@ -279,7 +277,7 @@ def test_fewer_views_than_asked(boxes, tmp_path):
 
 
 def test_a_subject_alone_is_read_without_targets(boxes):
-    """Four cameras that are all inputs leave no target: a splat needs none."""
+    """A splat needs no target, so that a subject whose cameras are all inputs can be read."""
     data = module(
         boxes, targets={"name": "cameras", "view": 0, "training_views": [0], "positions": [0, 4, 8, 12]}
     )
@@ -296,13 +294,13 @@ def test_a_subject_alone_is_read_without_targets(boxes):
 
 @pytest.mark.parametrize("count", [0, 17])
 def test_a_number_of_views_that_a_ring_does_not_have_is_refused(boxes, count):
-    """0 views were measured as 4, and 17 of 16 took one position twice."""
+    """0 views must not count as 4, nor may 17 of 16 repeat a position."""
     with pytest.raises(InputError, match=f"evaluation with {count} views: expected different positions"):
         module(boxes).evaluation_loader(views=count)
 
 
 def test_the_seed_of_the_data_reaches_training_and_random_targets(boxes):
-    """Two seeds differ and one repeats, as batches."""
+    """Equal seeds give equal batches, different seeds different ones."""
     random = {"name": "random", "per_subject": 3}
     for draw in (
         lambda seed: [
@@ -326,18 +324,19 @@ def sampler(views=RANDOM, targets=None, **changes) -> TrainingSampler:
 
 
 def test_training_samples_depend_on_seed_step_and_index_only():
-    """A resumed run sees what an uninterrupted one sees; no global generator matters."""
+    """Samples are the same in any order of steps, and do not depend on global generators."""
     forward = [sampler().batch(step) for step in range(40)]
     backward = [sampler().batch(step) for step in reversed(range(40))][::-1]
     assert forward == backward
     assert forward != [sampler(seed=1).batch(step) for step in range(40)]
     torch.manual_seed(5)
-    np.random.seed(5)  # noqa: NPY002  no global generator has a say
+    np.random.seed(5)  # noqa: NPY002  global generators must not matter
     assert forward[7] == sampler().batch(7)
 
 
 def test_batches_of_a_class_have_one_number_of_inputs():
-    """Their subjects and cameras differ, and every number is drawn."""
+    """Consecutive batches share the number of inputs, with different subjects and cameras, and all numbers
+    occur."""
     batches = [sampler(class_steps=8).batch(step) for step in range(160)]
     counts = [len(batch[0].inputs) for batch in batches]
     assert all(len(set(counts[first : first + 8])) == 1 for first in range(0, 160, 8))
@@ -348,8 +347,7 @@ def test_batches_of_a_class_have_one_number_of_inputs():
 
 
 def test_training_samples_are_fair():
-    """Every subject once in each round, all counts, positions and views,
-    no target among the inputs."""
+    """Each epoch has every subject once; all counts, positions and views occur, and no target is an input."""
     batches = [sampler().batch(step) for step in range(300)]
     for batch in batches:
         assert len({len(d.inputs) for d in batch}) == 1
@@ -358,7 +356,7 @@ def test_training_samples_are_fair():
             assert len(set(sample.targets)) == 3
             assert not set(sample.targets) & set(sample.inputs)
     names = [d.subject for batch in batches for d in batch]
-    for start in range(0, 600, 5):  # every subject once in each round
+    for start in range(0, 600, 5):  # every subject once per epoch
         assert sorted(names[start : start + 5]) == ["s0", "s1", "s2", "s3", "s4"]
     assert len({tuple(names[s : s + 5]) for s in range(0, 600, 5)}) > 30
     counts = np.bincount([len(batch[0].inputs) for batch in batches], minlength=6)[3:]
@@ -371,7 +369,7 @@ def test_training_samples_are_fair():
 
 
 def test_processes_share_out_one_sequence():
-    """Several processes train on the samples of one, each sample once."""
+    """Several processes train on the samples of a single one, each sample once."""
     whole = [d.subject for step in range(5) for d in sampler(batch_size=4).batch(step)]
     ranks = [[sampler().batch(step, rank, 2) for step in range(5)] for rank in range(2)]
     assert whole == [d.subject for step in range(5) for rank in range(2) for d in ranks[rank][step]]
@@ -380,7 +378,7 @@ def test_processes_share_out_one_sequence():
 
 
 def test_even_training_views_keep_their_spacing():
-    """views.training=even turns the ring but keeps the distances."""
+    """views.training=even rotates the positions but keeps their spacing."""
     even = sampler(ViewProtocol(training_counts=(5,), training="even"))
     starts = set()
     for step in range(60):
@@ -391,7 +389,7 @@ def test_even_training_views_keep_their_spacing():
 
 
 def test_seeds_choose_photographs_as_well_as_the_order_of_subjects():
-    """Of a single subject, whose order is no choice; numbers of views, too."""
+    """With a single subject, the seed still determines views and their number."""
     one = {"subjects": {"a": FULL}, "batch_size": 1}
 
     def drawn(seed):

@@ -1,4 +1,4 @@
-"""ZJU-MoCap and HuMMan-Recon: every oddity of their formats, on miniatures in their true layouts."""
+"""ZJU-MoCap and HuMMan-Recon: peculiarities of their formats, on miniatures in their layouts."""
 
 import pickle
 import shutil
@@ -46,7 +46,7 @@ def test_bodies_project_into_every_mask(zju_root):
 
 @pytest.mark.parametrize(("camera", "mode"), [(0, "L"), (3, "RGB")])
 def test_any_label_is_the_performer(zju_root, camera, mode):
-    """Label maps have many labels, in one channel or three; any but 0 is the performer."""
+    """Label maps have many labels in one or three channels, and all except 0 are the performer."""
     path = zju_root / f"CoreView_386/mask_cihp/Camera_B{camera + 1}/000000.png"
     image = Image.open(path)
     labels = np.asarray(image).reshape(SIZE, SIZE, -1)[..., 0]
@@ -57,7 +57,7 @@ def test_any_label_is_the_performer(zju_root, camera, mode):
 
 
 def test_masks_are_united(zju_root):
-    """Several folders of masks give their union."""
+    """Masks of several folders are united."""
     parts = [of_zju(zju_root, undistorted=False, masks=[m]).view("CoreView_386_000000", 5).mask for m in BOTH]
     union = of_zju(zju_root, undistorted=False, masks=BOTH).view("CoreView_386_000000", 5).mask
     np.testing.assert_array_equal(union, parts[0] | parts[1])
@@ -73,8 +73,7 @@ def test_a_sequence_without_the_second_folder_of_masks_is_read(zju_root, tmp_pat
 
 
 def test_undistortion_is_that_of_opencv():
-    """The published calibrations are OpenCV's;
-    our undistortion agrees with stored results of it."""
+    """Undistortion agrees with recorded results of OpenCV, with which the data sets were calibrated."""
     height, width = OPENCV["image"].shape[:2]
     grid = undistorting_grid(half_centers(OPENCV["intrinsics"]), OPENCV["distortion"].ravel(), height, width)
     image, mask = undistort(OPENCV["image"], np.full((height, width), 255, np.uint8), grid)
@@ -86,14 +85,14 @@ def test_undistortion_is_that_of_opencv():
 
 
 def test_cameras_are_the_first_so_many(zju_root):
-    """data.cameras selects the first cameras of a sequence."""
+    """data.cameras is the number of cameras used, the first ones of a sequence."""
     assert of_zju(zju_root).reader.subjects["CoreView_386_000000"] == tuple(range(20))
     assert len(of_zju(zju_root, cameras=None).reader.subjects["CoreView_386_000000"]) == 23
     assert len(of_zju(zju_root, "313", cameras=None).reader.subjects["CoreView_313_000001"]) == 21
 
 
 def test_old_sequences_count_frames_from_one(zju_root):
-    """313 and 315 number their frames from 1, and have 21 cameras."""
+    """Sequences 313 and 315 number their frames from 1."""
     data = of_zju(zju_root, "313")
     assert list(data.reader.subjects) == ["CoreView_313_000001", "CoreView_313_000002"]
     assert not (zju_root / "CoreView_313" / "new_vertices" / "0.npy").exists()
@@ -104,7 +103,7 @@ def test_old_sequences_count_frames_from_one(zju_root):
 
 @pytest.mark.parametrize("renamed", ["photographs", "masks", "both"])
 def test_old_sequences_are_read_with_long_and_short_names(zju_root, tmp_path, renamed):
-    """Renamed files of 313 and 315 are found, too."""
+    """Files of 313 and 315 are found under their original and their short names."""
     shutil.copytree(zju_root / "CoreView_313", tmp_path / "CoreView_313")
     assert len(next((tmp_path / "CoreView_313").glob("Camera (22)/*.jpg")).stem.split("_")) == 7
     patterns = {"photographs": ["Camera*/*.jpg"], "masks": ["mask*/Camera*/*.png"]}
@@ -168,7 +167,7 @@ def test_the_new_fit_is_preferred(zju_root, tmp_path):
 
 
 def test_frames_are_places_in_the_annotations(zju_root):
-    """Frames are indices, not frame numbers; an impossible start is refused."""
+    """Frames are indices in annots.npy, not frame numbers; a start beyond the end raises."""
     assert list(of_zju(zju_root, frames=(1, 500, 5)).reader.subjects) == ["CoreView_386_000001"]
     assert list(of_zju(zju_root, frames=(0, 500, 5)).reader.subjects) == ["CoreView_386_000000"]
     with pytest.raises(InputError, match="expected a frame 700; found 2 frames"):
@@ -176,7 +175,7 @@ def test_frames_are_places_in_the_annotations(zju_root):
 
 
 def test_the_default_split_is_sherfs(zju_root):
-    """The split that the paper follows, in the shipped configuration."""
+    """The shipped configuration has SHERF's split, which the paper uses."""
     data = build_data("zju_mocap", zju_root).dataset
     train, val = data.split.train, data.split.val
     assert [s.sequences for s in train] == [("386", "387", "390", "392", "393", "394")]
@@ -187,7 +186,8 @@ def test_the_default_split_is_sherfs(zju_root):
 
 
 def test_batches_have_the_protocols_cameras(zju_root):
-    """Inputs 0 7 15 and all 17 other cameras as targets; frames are not people."""
+    """For 3 views inputs are 0 7 15 and targets all 17 other cameras; frames of a person count as one
+    person."""
     data = build_data("zju_mocap", zju_root, "data.size=64", "data.workers=0", "views=v3")
     batch = data.training_batch(0)
     assert batch.images.shape == (1, 3, 3, 64, 64)
@@ -200,7 +200,7 @@ def test_batches_have_the_protocols_cameras(zju_root):
 
 
 def test_other_protocols_are_configurations(zju_root):
-    """NHP's and GP-NeRF's numbers of frames and inputs."""
+    """Configurations of NHP and GP-NeRF have their numbers of frames and inputs."""
     nhp = build_data("zju_mocap_nhp", zju_root)
     assert (
         sum(len(range(*s.frames)) * len(s.sequences) for s in nhp.dataset.split.train)
@@ -216,8 +216,7 @@ def test_other_protocols_are_configurations(zju_root):
 
 
 def test_photographs_are_undistorted_about_their_own_pixel_centers(zju_root):
-    """Calibrations count centres from integers;
-    half a pixel would bend the photograph elsewhere."""
+    """Calibrations have pixel centres at integers; an offset of half a pixel would undistort wrongly."""
     cameras, frames = read_annotations(zju_root / "CoreView_386" / "annots.npy")
     bent = of_zju(zju_root, undistorted=False).view("CoreView_386_000000", 7)
     path = zju_root / "CoreView_386" / frames[0][7]
@@ -239,13 +238,13 @@ def of_humman(root: Path, size=None, **options) -> Photographs:
 
 
 def test_frames_are_multiples_of_6_and_some_lack(humman_root):
-    """Frames that a sequence lacks are left out; all ten cameras are positions."""
+    """Frames that a sequence lacks are skipped; all ten cameras are positions."""
     assert list(of_humman(humman_root).reader.subjects) == [f"{HUMMAN}_{n:06d}" for n in (0, 6, 18)]
     assert set(of_humman(humman_root).reader.subjects.values()) == {tuple(range(10))}
 
 
 def test_a_camera_that_lacks_a_frame_is_left_out(humman_root, tmp_path):
-    """A missing photograph removes one camera from one frame, not the frame."""
+    """A missing image removes one camera from its frame, not the whole frame."""
     shutil.copytree(humman_root / HUMMAN, tmp_path / HUMMAN)
     (tmp_path / HUMMAN / "kinect_color" / "kinect_004" / "000006.png").unlink()
     subjects = of_humman(tmp_path).reader.subjects
@@ -266,7 +265,7 @@ def test_named_sequences_are_for_testing_and_the_rest_for_training(humman_root, 
 
 
 def test_any_value_of_the_matting_is_the_performer(humman_root):
-    """Soft values of the matting count as the performer, too."""
+    """Low values of the matting are the performer, too."""
     path = humman_root / HUMMAN / "kinect_mask" / "kinect_002" / "000006.png"
     matting = np.asarray(Image.open(path))
     assert ((matting > 0) & (matting < 128)).any()
@@ -274,14 +273,14 @@ def test_any_value_of_the_matting_is_the_performer(humman_root):
 
 
 def test_drawn_masks_are_read_where_there_are_any(humman_root):
-    """The option data.masks selects another folder, which only test sequences have."""
+    """data.masks selects the folder of manual masks, which only test sequences have."""
     view = of_humman(humman_root, masks="kinect_mask_manual").view(f"{HUMMAN}_000006", 2)
     assert view.mask.sum() < of_humman(humman_root).view(f"{HUMMAN}_000006", 2).mask.sum()
     assert not (humman_root / "p100001_a000048" / "kinect_mask_manual").exists()
 
 
 def test_no_body_is_a_choice(humman_root):
-    """Without a body a batch says so, and training without Chamfer loss is possible."""
+    """Without a body model, ``body_vertices`` of batches is None, for training without the Chamfer loss."""
     assert of_humman(humman_root).body(f"{HUMMAN}_000000") is None
     batch = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0").training_batch(0)
     assert batch.body_vertices is None
@@ -289,7 +288,7 @@ def test_no_body_is_a_choice(humman_root):
 
 
 def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(humman_root):
-    """The documented protocol: inputs 0 3 6 and seven targets; frames are not people."""
+    """The documented protocol has inputs 0 3 6 and seven targets; frames of a person count as one person."""
     data = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0")
     samples = list(data.evaluation_loader(views=3))
     assert len(samples) == 3
@@ -304,7 +303,7 @@ def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(humman_root
 
 
 def test_smpl_vertices_project_into_every_mask(humman_root):
-    """Model, parameters and cameras agree about where the body is."""
+    """Model, parameters and cameras are consistent."""
     pytest.importorskip("smplx")
     data = of_humman(humman_root, smpl_model=humman_root.with_name("recon_body_models"))
     for name in data.reader.subjects:
@@ -313,7 +312,7 @@ def test_smpl_vertices_project_into_every_mask(humman_root):
 
 
 def test_smpl_turns_about_the_pelvis_and_then_shifts(humman_root):
-    """The order of rotation and translation is SMPL's."""
+    """The body rotates about the pelvis before it is translated, as SMPL defines."""
     pytest.importorskip("smplx")
     from ghgs_lit.data.smpl import Body
 
@@ -334,7 +333,7 @@ def test_smpl_turns_about_the_pelvis_and_then_shifts(humman_root):
 
 
 class Ch:
-    """As chumpy's arrays are pickled: an object with its array under ``x``."""
+    """Stand-in for chumpy's array, an object with its values under ``x``."""
 
     def __init__(self, x):
         self.x = x
@@ -342,7 +341,7 @@ class Ch:
 
 @pytest.mark.parametrize("protocol", [0, 2])
 def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monkeypatch, protocol):
-    """Users of the official file need no package that no longer installs."""
+    """The official file can be read without chumpy, which no longer installs."""
     module = type(sys)("chumpy.ch")
     module.Ch, Ch.__module__, Ch.__qualname__ = Ch, "chumpy.ch", "Ch"
     monkeypatch.setitem(sys.modules, "chumpy", type(sys)("chumpy"))

@@ -1,4 +1,4 @@
-"""Mattes of photographs: the network by itself, and what it finds of crops whose masks are off."""
+"""Matting: the network alone, and refined crops of captures with inaccurate masks."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from tests.helpers.figures import Figure
 
 @pytest.fixture
 def network():
-    """With random weights also in its last layer."""
+    """A network with random weights also in its last layer."""
     torch.manual_seed(0)
     found = MattingNetwork().eval()
     torch.nn.init.normal_(found.out.weight, std=0.3)
@@ -60,7 +60,7 @@ def test_photographs_do_not_depend_on_their_batch_mates(network):
 
 
 def test_colors_change_at_the_rim_alone(network):
-    """Where the matte is 1, the photograph shows nothing but the subject."""
+    """Where the matte is 1, the image shows only the subject and keeps its colours."""
     images, mattes = photographs()
     torch.nn.init.zeros_(network.out.weight[:1])
     found, subjects = network(images, mattes)
@@ -70,7 +70,7 @@ def test_colors_change_at_the_rim_alone(network):
 
 
 def test_training_pulls_from_beyond_0_and_1(network):
-    """Mattes are cut off in evaluation alone, so that every error has a gradient."""
+    """Mattes are clamped only in evaluation, so that every error has a gradient in training."""
     images, mattes = photographs()
     found, _ = network.train()(images, mattes)
     assert found.min() < 0 or found.max() > 1
@@ -79,7 +79,7 @@ def test_training_pulls_from_beyond_0_and_1(network):
 
 
 def test_insideness_is_the_distance_from_the_outline():
-    """Which runs half-way between pixels; found by going through all pairs."""
+    """Distances from the outline, half-way between pixels, equal those from all pairs of pixels."""
     mask = np.random.default_rng(0).uniform(size=(14, 11)) < 0.5
     places = np.argwhere(np.ones_like(mask))
     apart = cdist(places, places)
@@ -94,8 +94,7 @@ def test_without_an_outline_all_is_far_from_it(value):
 
 
 def test_colors_nearby_are_weighted_means():
-    """Of one colour on each side: that colour wherever something weighs;
-    black, not NaN, elsewhere."""
+    """The mean of a single colour is that colour, and black instead of NaN without weights."""
     weight = torch.zeros(1, 1, 12, 12)
     weight[..., :6] = 0.7
     color = torch.tensor([0.2, 0.5, 0.9])[None, :, None, None]
@@ -105,7 +104,8 @@ def test_colors_nearby_are_weighted_means():
 
 
 def test_colors_do_not_train_the_matte(network):
-    """A matte that lets in more of the background would be the easiest way to other colours."""
+    """The loss of colours must not reach the matte, which could otherwise change colours by including more
+    background."""
     images, mattes = photographs()
     found, subjects = network.train()(images, mattes)
     colors = (subjects / found[:, None]).movedim(1, -1)[found > 0.2]
@@ -120,8 +120,7 @@ HEIGHT, WIDTH = 216, 180
 
 @pytest.fixture(scope="module")
 def scene():
-    """A textured ellipse before a cloudy background: the photograph, its colours on black,
-    its matte."""
+    """A textured ellipse in front of a cloudy background: image, colours on black, matte."""
     rng = np.random.default_rng(3)
     v, u = np.mgrid[: 4 * HEIGHT, : 4 * WIDTH] / 4
     inside = ((u - 93) / 51) ** 2 + ((v - 105) / 81) ** 2 < 1
@@ -138,7 +137,8 @@ def scene():
 
 
 def masks_of(alpha):
-    """Wrong masks by name: off by up to 2.5 pixels, one with a hole 6 pixels wide."""
+    """Masks by name: the exact one, and wrong ones that are off by up to 2.5 pixels or have a hole 6 pixels
+    wide."""
     mask = alpha > 127
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     bumps = gaussian_filter(np.random.default_rng(1).standard_normal(mask.shape), 3)
@@ -158,8 +158,7 @@ def error(matte, alpha):
 
 @pytest.mark.parametrize("name", ["exact", "grown", "shrunk", "ragged", "holed"])
 def test_the_photograph_mends_the_mask(scene, name):
-    """What is left is a small part of the mask's error,
-    and no background is left in the colours."""
+    """The refined matte has less than 0.4 of the mask's error, and its colours less than 0.65."""
     photograph, premultiplied, alpha = scene
     mask = (255 * masks_of(alpha)[name]).astype(np.uint8)
     subject, matte = refined_matte(photograph, mask, 4)
@@ -170,20 +169,21 @@ def test_the_photograph_mends_the_mask(scene, name):
 
 
 def test_far_from_the_outline_the_mask_decides(scene):
-    """A hole wider than twice the pixels stays open in its middle; nothing appears far away."""
+    """Pixels farther from the outline than the limit stay as in the mask, such as the middle of a wide
+    hole."""
     photograph, _, alpha = scene
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     place = np.hypot(v - 105, u - 93)
     mask = (255 * ((alpha > 127) & (place >= 9))).astype(np.uint8)
     _, matte = refined_matte(photograph, mask, 4)
     assert (matte[place < 4] == 0).all()
-    far = np.abs(signed_distance(mask > 0)) + 0.5 > 4  # pixels to the nearest one on the other side
+    far = np.abs(signed_distance(mask > 0)) + 0.5 > 4  # distance to the nearest pixel of the other side
     assert (matte[far] == mask[far]).all()
     assert (matte != mask)[~far].any()
 
 
 def test_a_subject_that_the_border_cuts_stays_whole_there(scene):
-    """The border of the image is no outline."""
+    """The image border does not count as an outline."""
     photograph, _, alpha = (part[:150, :120] for part in scene)
     _, matte = refined_matte(photograph, np.where(alpha > 127, 255, 0).astype(np.uint8), 4)
     assert (matte[-1][alpha[-1] == 255] > 240).all()
@@ -202,7 +202,8 @@ def test_masks_without_an_outline_stay(value, size):
 
 @pytest.mark.parametrize("height", [128, 512])
 def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, height):
-    """Or at that of the photograph where it is smaller; limits are in pixels of the crops."""
+    """Mattes are estimated at twice the crop size, or at the image's size if that is smaller, with limits in
+    pixels of the crops."""
     calls = []
 
     def record(image, matte, pixels):
@@ -221,7 +222,7 @@ def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, heig
 
 
 def test_crops_of_wrong_masks_hold_the_subject_alone(tmp_path):
-    """Of photographs larger than the crops; cameras are those of the given masks."""
+    """Crops of larger images contain almost no background, and cameras stay those of the given masks."""
     figure = Figure(height=256, width=192)
     exact = Capture.read(tmp_path, figure.write(tmp_path))
     grown = tuple(
@@ -239,7 +240,7 @@ def test_crops_of_wrong_masks_hold_the_subject_alone(tmp_path):
 
 
 def test_a_matte_that_loses_the_subject_is_refused(monkeypatch, tmp_path):
-    """The mask stays as it is, and the warning names the photograph."""
+    """The mask stays unchanged, and a warning names the image."""
     figure = Figure()
     taken = Capture.read(tmp_path, figure.write(tmp_path))
     monkeypatch.setattr(matting, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
