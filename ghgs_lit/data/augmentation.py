@@ -114,7 +114,6 @@ class Augmentation(Options):
             size: configured (height, width) of the inputs in pixels.
             target: configured (height, width) of the targets in pixels, which sampled sizes never
                 exceed.
-            seed: seed of the run.
             step: training step, equal in all processes.
 
         Returns:
@@ -137,8 +136,6 @@ class Augmentation(Options):
 
         Args:
             batch: samples as read from disk.
-            seed: seed of the run.
-            step: training step.
             indices: indices of the samples in the run.
 
         Returns:

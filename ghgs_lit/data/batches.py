@@ -30,13 +30,8 @@ class TrainingBatches(Dataset):
     """Training batches; item ``step`` is the batch of process ``rank`` of ``world`` at a step of the run.
 
     Args:
-        photographs: images of the subjects.
-        sampler: selects the samples of a step.
-        augmentation: augmentation of batches.
         length: number of steps of an epoch.
         depths: whether depth maps of the inputs are read.
-        rank: index of this process.
-        world: number of processes.
     """
 
     photographs: Photographs
@@ -67,8 +62,6 @@ class EvaluationBatches(Dataset):
     """Batches of fixed samples; an item contains consecutive samples with equal target protocols.
 
     Args:
-        photographs: images of the subjects.
-        samples: the samples.
         batch_size: maximum number of samples of an item.
     """
 
@@ -137,7 +130,6 @@ def make_loader(batches: Dataset, workers: int, **options: Any) -> DataLoader:
     """Build a loader for a dataset whose items are whole batches.
 
     Args:
-        batches: dataset of batches.
         workers: number of worker processes; 0: none.
         options: further options of ``DataLoader``, such as a sampler.
     """

@@ -145,7 +145,6 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
 
     Args:
-        data: the data module.
         min_iou: minimum IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75 to
             0.95, wrong cameras 0 to 0.4.
         min_agreement: without a body, the minimum share of a mask that the subject's other masks allow,

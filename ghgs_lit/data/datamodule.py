@@ -82,11 +82,7 @@ class PhotographsDataModule(LightningDataModule):
     """Loaders of a data set for training and evaluation.
 
     Args:
-        dataset: options of the data set.
-        views: protocol of the input views.
-        targets: protocol of the target views.
         seed: seed of all random numbers.
-        augmentation: augmentation of training batches; None: none.
 
     Raises:
         InputError: an unknown key or an impossible value; while data is read, a missing or bad file.
@@ -163,8 +159,6 @@ class PhotographsDataModule(LightningDataModule):
 
         Args:
             length: number of steps of an epoch.
-            rank: index of the process.
-            world: number of processes.
         """
         photographs = self.photographs("train")
         parts = (photographs, self.training_sampler(), self.augmentation)
@@ -222,7 +216,6 @@ class PhotographsDataModule(LightningDataModule):
             views: number of input views; None: the view protocol's.
             targets: one or several protocols, or their mappings, whose targets are concatenated in each
                 sample; None: this module's.
-            split: name of the split.
             batch_size: samples of a batch; None: the data set's.
 
         Raises:
@@ -243,8 +236,6 @@ class PhotographsDataModule(LightningDataModule):
         """Fixed sample of one subject, as a batch; other subjects are not read.
 
         Args:
-            subject: name of the subject.
-            split: its split.
             views: number of input views; None: the view protocol's.
             targets: as for :meth:`evaluation_loader`, except that None gives a batch without targets.
         """

@@ -24,7 +24,6 @@ def required_folder(key: str, expected: str, value: str | None) -> Path:
     Args:
         key: key of the configuration, for the message.
         expected: description of the folder, for the message.
-        value: value of the key.
 
     Raises:
         InputError: the value is null.

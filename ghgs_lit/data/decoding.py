@@ -75,7 +75,6 @@ def read_array(path: Path, shapes: Shapes) -> np.ndarray:
     """Read an ``.npy`` file as a finite float64 array.
 
     Args:
-        path: the file.
         shapes: see :func:`check_array`.
 
     Raises:
@@ -208,7 +207,6 @@ def check_view(place: Path | str, view: View) -> None:
 
     Args:
         place: name of the image, for the message.
-        view: result of a reader.
 
     Raises:
         InputError: an array or the camera is wrong.

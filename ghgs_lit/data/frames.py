@@ -102,7 +102,6 @@ class FrameReader(Reader):
     cameras. Missing sequences are skipped.
 
     Args:
-        data: options of the data set.
         phase: ``train`` or ``val``.
         sequences: name and requested frames of each sequence.
         example: name of a sequence, for messages.
@@ -142,7 +141,6 @@ class FrameReader(Reader):
         """Find the requested frames of a sequence.
 
         Args:
-            folder: folder of the sequence.
             wanted: numbers of the requested frames.
 
         Raises:

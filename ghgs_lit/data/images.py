@@ -68,7 +68,6 @@ def orientation_of(image: Image.Image, path: Path) -> int:
     Damaged EXIF data gives a warning.
 
     Args:
-        image: the opened image.
         path: its file, for the warning.
     """
     try:
@@ -86,7 +85,6 @@ def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
     or describes other pixels gives a warning, and colours are taken as sRGB.
 
     Args:
-        image: the opened image.
         path: its file, for messages.
 
     Returns:

@@ -38,7 +38,6 @@ def draw_color_gains(
         views: number of cameras V.
         exposure: maximum deviation of a camera in stops, at least 0.
         white_balance: maximum deviation of red and of blue from green in stops, at least 0.
-        rng: random generator.
 
     Returns:
         Factors [V, 3] above 0.
@@ -56,7 +55,6 @@ def draw_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Floa
     Args:
         views: number of cameras V.
         gamma: maximum absolute natural logarithm of a power, at least 0.
-        rng: random generator.
     """
     deviation = rng.uniform(-1, 1, views)
     deviation -= deviation.mean()
@@ -96,7 +94,6 @@ def perturb_mask(
         ragged: maximum height of bumps of the outline in pixels, at least 0.
         hole: maximum diameter of a missing round piece, as a fraction of the subject's height.
         hole_chance: probability of a missing piece, in [0, 1].
-        rng: random generator.
     """
     grow, height, missing, size, place = rng.uniform(size=5)
     bumps = rng.uniform(-1, 1, [side // _BUMP + 2 for side in mask.shape])
@@ -129,9 +126,6 @@ def draw_backgrounds(
 
     Args:
         views: number of cameras V.
-        height: image height h.
-        width: image width w.
-        rng: random generator.
 
     Returns:
         Colours [V, 3, h, w] float32 in [0, 1].
@@ -164,9 +158,7 @@ def perturb_cameras(
 
     Args:
         cameras: true cameras [V].
-        masks: masks of the subject.
         pixels: maximum error in pixels, above 0.
-        rng: random generator.
 
     Returns:
         Cameras [V] of the same sizes and dtypes.

@@ -116,7 +116,6 @@ class Layout(Reader):
     """Reader of one phase of a rendered data set.
 
     Args:
-        root: folder of the data set.
         phase: ``train`` or ``val``.
         names: subjects to read; those that are not in the phase's folder are read from the other one, as
             the split may have changed; None: all.

@@ -50,7 +50,6 @@ class Packs:
 
     Args:
         reader: reader of the original files; a subject's packed file depends on its ``sources``.
-        folder: folder of the packed files.
         size: (height, width) of the packed images in pixels; None: as stored.
         resampling: method of resizing, see :func:`ghgs_lit.data.view.resize_view`.
         views: numbers of the views that are packed at each position.

@@ -83,7 +83,6 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
     """Read the arrays, scalars and plain containers of a pickle.
 
     Args:
-        path: the file.
         also: harmless replacements for further names (module, name).
 
     Raises:

@@ -51,7 +51,6 @@ class Reader(ABC):
         """Read one image with its mask and camera at its stored size.
 
         Args:
-            name: name of the subject.
             position: index of the camera, or position on the ring.
             view: number of the view at the position; 0 except on rings with further views.
             depth: also read the depth map, if there is one.
@@ -132,7 +131,6 @@ class Photographs:
     """Images of a reader: resizes them, caches them in memory, and collates them into batches.
 
     Args:
-        reader: reader of the data set.
         size: (height, width) of the inputs in pixels; None: as stored.
         cache_mb: MiB of decoded views and bodies cached in each process, at least 0; the least recently
             used are dropped first.
@@ -168,7 +166,6 @@ class Photographs:
         """Read one image, resized together with its maps and intrinsics.
 
         Args:
-            name: name of the subject.
             position: index of the camera, or position on the ring.
             view: number of the view at the position.
             depth: also read the depth map, if there is one.

@@ -77,7 +77,6 @@ class ViewProtocol(Options):
             available: positions that the subject has.
             count: number of inputs.
             ring: number of positions of a full ring.
-            rng: random generator.
         """
         if self.training != "any":
             start = int(rng.integers(ring))
@@ -162,7 +161,6 @@ class TargetProtocol(Options):
             available: positions that the subject has.
             inputs: positions of the inputs.
             count: number of images.
-            rng: random generator.
 
         Raises:
             InputError: fewer than ``count`` exist.
@@ -222,11 +220,8 @@ class TrainingSampler:
 
     Args:
         subjects: camera positions of each subject.
-        views: protocol of the input views.
-        targets: protocol of the target views.
         ring: number of positions of a full ring.
         batch_size: samples per step and process.
-        seed: seed of the run.
         class_steps: number of consecutive steps with equal numbers of inputs.
 
     Raises:
@@ -254,13 +249,7 @@ class TrainingSampler:
                 )
 
     def batch(self, step: int, rank: int = 0, world: int = 1) -> list[Sample]:
-        """Samples of one process at a step, with equal numbers of inputs.
-
-        Args:
-            step: training step.
-            rank: index of the process.
-            world: number of processes.
-        """
+        """Samples of one process at a step, with equal numbers of inputs."""
         numbers = [self.seed, _COUNT, step // self.class_steps]
         count = int(np.random.default_rng(numbers).choice(self.views.training_counts))
         return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
@@ -295,7 +284,6 @@ def evaluation_samples(
     Args:
         subjects: camera positions of each subject.
         count: number of inputs, above 0.
-        protocols: protocols of the target views.
         ring: number of positions of a full ring.
         seed: seed of random targets.
         positions: lists of input positions; if none has length ``count``, inputs are evenly spaced.

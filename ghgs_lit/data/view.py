@@ -205,7 +205,6 @@ def resize_view(view: View, size: tuple[int, int] | None, resampling: str = "are
     sampled at the centres of new pixels.
 
     Args:
-        view: the view to resize.
         size: new (height, width) in pixels; None: unchanged.
         resampling: ``area`` shifts nothing; ``release``, as in the authors' code, resizes images with
             Pillow's bicubic filter and masks with OpenCV's nearest neighbour.

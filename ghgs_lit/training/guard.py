@@ -88,7 +88,6 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
     Args:
         module: module with ``model``, ``renderer``, ``losses`` and ``forward_losses``, such as
             :class:`~ghgs_lit.training.module.GHGSModule`.
-        step: inputs of the step.
         scale: factor of the loss (``16-mixed``).
 
     Returns:
@@ -144,7 +143,6 @@ class Guard:
         synchronisation.
 
         Args:
-            trainer: the run's Trainer.
             norm: norm of the gradient, a scalar.
 
         Returns:

@@ -127,7 +127,6 @@ class WandbLog(WandbLogger):
         """Log values at the number of steps taken. Steps that are trained again do not replace values.
 
         Args:
-            metrics: values by name.
             step: Lightning's step, one less than the number of steps taken."""
         taken = None if step is None else step + 1
         self.experiment.log({**metrics, "trainer/global_step": taken}, step=taken)
@@ -153,7 +152,6 @@ def begin(loggers: Sequence[Logger], config: str, step: int | None) -> None:
     """Begin the logs of a run, or continue those in its folder.
 
     Args:
-        loggers: the run's loggers.
         config: the resolved configuration as YAML, for TensorBoard's Text tab.
         step: number of steps taken at which the run continues; None: a new run."""
     for logger in loggers:
@@ -175,7 +173,6 @@ def log_results(
     them.
 
     Args:
-        loggers: the run's loggers.
         values: hyperparameters, from :func:`hyperparameters`.
         summary: rows of ``metrics.json``, one per protocol.
         table: the summary as a Markdown table.
@@ -227,7 +224,6 @@ def hyperparameters(
     without keys that do not affect results.
 
     Args:
-        config: the run's configuration.
         choices: the selected option of each config group.
         overrides: for a run of a sweep those that distinguish it, otherwise all.
 

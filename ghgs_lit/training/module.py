@@ -53,7 +53,6 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
     """Context in which the encoder processes the patches of a budget.
 
     Args:
-        model: the model whose encoder is set.
         budget: see :func:`drawn_budget`; None: as the model is configured."""
     return nullcontext() if budget is None else seeing(model.encoder, KeptTokens.of_budget(budget))
 
@@ -62,7 +61,6 @@ def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[N
     """Context in which the model predicts with a given number of rounds.
 
     Args:
-        model: the model whose rounds are set.
         count: number of rounds; None: each prediction samples one."""
     return nullcontext() if count is None else model.rounds.drawn(count)
 
@@ -127,7 +125,6 @@ class GHGSModule(BudgetedModule):
         """Load a module from a checkpoint of ``ghgs train`` or of any Trainer.
 
         Args:
-            checkpoint_path: the file.
             map_location: device of the weights; None: the CPU.
             **parts: ``renderer``, ``losses`` and ``optimization`` that replace the configured ones.
                 Their weights, if any, are loaded from the checkpoint.

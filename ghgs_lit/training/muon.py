@@ -167,7 +167,6 @@ class Muon(torch.optim.AdamW):
     """Optimizer with Muon for matrices (:func:`is_matrix`), and AdamW for all other parameters.
 
     Args:
-        parameters: parameters to optimise.
         matrix_lr: learning rate of matrices, whose steps are about as long as AdamW's at this rate. A
             number, or, like AdamW's ``lr``, a scalar tensor on the parameters' device, so that a
             captured step follows the schedule.

@@ -22,10 +22,6 @@ def check_start(run: "Train", directory: Path) -> None:
     """Reject ``init_from`` together with ``resume``, unless the run resumes in its own directory, where
     its configuration still contains the ``init_from`` with which it began.
 
-    Args:
-        run: configuration of the run.
-        directory: the run's directory.
-
     Raises:
         InputError: both are given."""
     if run.resume is None or run.init_from is None:
@@ -40,7 +36,6 @@ def check_resume(
     """Check that a run can resume from a checkpoint, and load its weights.
 
     Args:
-        path: the checkpoint.
         module: the module that gets the weights of all its submodules.
         config: the run's configuration as plain data.
 
@@ -71,8 +66,6 @@ def initialize(
     """Load those weights of a checkpoint that fit into a model.
 
     Args:
-        model: the model that gets the weights.
-        path: the checkpoint.
         strict: every tensor must fit, except those of other stages if the file contains only the
             encoder.
         random_frozen: frozen parameters may stay as initialised.
@@ -121,10 +114,6 @@ def with_origin(run: "Train", model: nn.Module) -> "Train":
     """Adopt ``encoder.weights``, the origin of the semantic features in tables, from the checkpoint from
     which a run starts.
 
-    Args:
-        run: configuration of the run.
-        model: the run's model.
-
     Returns:
         The configuration with the checkpoint's ``encoder.weights``, if it has this key and all these
         weights fit; otherwise ``run`` unchanged."""
@@ -146,12 +135,10 @@ def with_origin(run: "Train", model: nn.Module) -> "Train":
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """Summarise what was loaded, and write all lines to a file.
+    """Summarise what was loaded, and write all lines to the file ``written``.
 
     Args:
         lines: result of :func:`initialize`.
-        path: the checkpoint.
-        written: the file.
 
     Returns:
         At most 22 lines of text, in which loaded tensors are only counted."""

@@ -70,10 +70,7 @@ class Pictures(Callback):
         """Log the subjects of a batch, up to the configured number.
 
         Args:
-            trainer, pl_module: those of the run.
-            outputs: result of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`.
-            batch: the validated batch.
-            *args: not used."""
+            outputs: result of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`."""
         self._stack.close()
         prediction = outputs["prediction"]
         image = outputs["rendering"].image
