@@ -1,5 +1,4 @@
-"""The frame of the subject: any unit, origin and direction of the world give one and the
-same scene."""
+"""The subject's frame: predictions do not depend on unit, origin and axes of the world."""
 
 import dataclasses
 import functools
@@ -18,8 +17,7 @@ from tests.helpers.scenes import CENTER, ellipsoid, make_batch, ring
 
 
 def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
-    """Cameras of the same photographs in a world that was scaled, turned and shifted,
-    in float64."""
+    """The cameras of a batch in a world that was scaled, rotated and translated, in float64."""
     turn = torch.eye(3).double() if turn is None else turn
     extrinsics = cameras.extrinsics.double().clone()
     rotation = extrinsics[..., :3, :3] @ turn.mT
@@ -30,7 +28,7 @@ def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
 
 @functools.cache
 def original(name):
-    """A tiny model, a batch with cameras in float64, and what it predicts and shows of it."""
+    """A tiny model, a batch with cameras in float64, its prediction and a render."""
     model, batch = make_model(f"model={name}").eval(), make_batch(1, 3)
     batch = dataclasses.replace(batch, cameras=moved(batch.cameras))
     with torch.no_grad():
@@ -46,7 +44,7 @@ def original(name):
     away=st.sampled_from([0.0, 1e4, 1e5]),
 )
 def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away):
-    """The box of the bounds had the world's axes, limits were metres, and 100 km cost 11 mm."""
+    """Regression: the bounds' box was aligned with the world, limits were metres, and 100 km cost 11 mm."""
     model, batch, expected, image = original(name)
     turn = quaternion_to_matrix(torch.tensor(turn).double())
     shift = (away * scale, -0.3 * away * scale, 0.1 * away * scale)
@@ -77,7 +75,7 @@ def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away
 
 @pytest.mark.parametrize("name", ["paper", "hull"])
 def test_the_order_of_the_views_after_the_first_does_not_matter(name):
-    """Gaussians of each view stay, up to rounding."""
+    """The Gaussians of each view stay the same up to rounding."""
     model, batch, expected, _ = original(name)
     order = [0, 2, 1]
     changed = dataclasses.replace(
@@ -93,7 +91,7 @@ def test_the_order_of_the_views_after_the_first_does_not_matter(name):
 
 
 def test_the_subject_is_as_tall_as_a_person_in_its_frame():
-    """In millimetres as in metres: 1.6 m of an ellipsoid become 1.8 m."""
+    """An ellipsoid of 1.6 m becomes 1.8 m tall, in a world in millimetres as in metres."""
     batch = make_batch(2, 4, 112, 112)
     for scale in (1.0, 1e3):
         frame = Frame.of(dataclasses.replace(batch, cameras=moved(batch.cameras, scale)))
@@ -103,7 +101,7 @@ def test_the_subject_is_as_tall_as_a_person_in_its_frame():
 
 
 def size_with(batch, masks):
-    """Size of the subject with other masks, relative to that with its own."""
+    """Size of the subject with other masks, relative to that with the true ones."""
     found, right = (Frame.of(b).metre for b in (dataclasses.replace(batch, masks=masks), batch))
     return float(found / right)
 
@@ -126,7 +124,7 @@ def test_one_wrong_mask_does_not_change_the_size(views, wrong):
 
 @pytest.mark.parametrize("view", [0, 1])
 def test_of_two_sizes_the_larger_counts(view):
-    """Masks are more often too small than too large."""
+    """Of two views the larger size is used, since masks are more often too small than too large."""
     batch = make_batch(1, 2, 112, 112, spread=180.0)
     masks = batch.masks.clone()
     masks[0, view, :41] = False  # the middle alone
@@ -135,7 +133,7 @@ def test_of_two_sizes_the_larger_counts(view):
 
 
 def test_a_subject_that_is_wider_than_tall_has_the_size_of_its_width():
-    """Photographs by cameras that are held upright or turned by 90 degrees."""
+    """Cameras are held upright, or turned by 90 degrees."""
     batch = make_batch(1, 3, 112, 112)
     lying = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     extrinsics, intrinsics = batch.cameras.extrinsics.clone(), batch.cameras.intrinsics.clone()
@@ -163,7 +161,7 @@ ROTATIONS = {
 
 @pytest.mark.parametrize("change", ROTATIONS)
 def test_axes_are_a_rotation_for_any_cameras(change):
-    """Mirrored extrinsics, rigs upside down and cameras that look straight down have a frame,
+    """Mirrored extrinsics, rigs upside down and cameras that look straight down give a proper rotation,
     too."""
     batch, cameras = make_batch(1, 3, 42, 42), ring(1, 3, 42, 42)
     cameras.extrinsics[..., :3, :3] = ROTATIONS[change](cameras.extrinsics[..., :3, :3].clone())
@@ -173,7 +171,7 @@ def test_axes_are_a_rotation_for_any_cameras(change):
 
 
 def test_the_origin_is_where_the_subject_stands():
-    """Not where the cameras look: half a metre beside it."""
+    """The origin is the subject's centre even if cameras look half a metre to its side."""
     cameras, place = ring(1, 4, 112, 112, zoom=0.6), CENTER + torch.tensor([0.3, 0.0, -0.4])
     masks, depths = ellipsoid(cameras, place)
     batch = Batch(torch.zeros(1, 4, 3, 112, 112), masks, cameras, depths=depths)
@@ -181,7 +179,7 @@ def test_the_origin_is_where_the_subject_stands():
 
 
 def test_a_shared_frame_is_that_of_all():
-    """Of instants of one sequence: mean origin, the first axes, and the size that most have."""
+    """Instants of one sequence share the mean origin, the first axes and the median size."""
     axes = quaternion_to_matrix(torch.randn(3, 4, generator=torch.Generator().manual_seed(0)).double())
     origin, metre = torch.tensor([[0.0, 0, 0], [1, 2, 3], [5, 1, 0]]), torch.tensor([5.0, 1.0, 2.0])
     shared = Frame(origin.double(), axes, metre.double()).shared
@@ -199,8 +197,7 @@ def test_an_element_has_the_same_frame_alone():
 
 
 def test_each_element_has_its_own_unit():
-    """One in metres and one in millimetres, in one batch: depths,
-    bounds and sizes of each are its own."""
+    """With one element in metres and one in millimetres, depths, bounds and sizes are in each one's unit."""
     batch = make_batch(2, 3)
     extrinsics = batch.cameras.extrinsics.double().clone()
     extrinsics[1, :, :3, 3] *= 1000
@@ -223,8 +220,7 @@ def test_each_element_has_its_own_unit():
 
 
 def test_units_of_nested_frames_are_multiplied():
-    """Gaussians that know how long a metre is in their frame know it in the world around
-    that frame."""
+    """The ``metre`` of Gaussians in a frame is multiplied by that of the frame."""
     gaussians = original("hull")[2].gaussians
     inner = dataclasses.replace(gaussians, metre=torch.tensor([4.0]))
     frame = Frame(torch.zeros(1, 3).double(), torch.eye(3).double()[None], torch.tensor([2.5]).double())

@@ -1,4 +1,4 @@
-"""Masks: premultiplied photographs, distances to outlines, and rays of a silhouette against the hull of
+"""Masks: premultiplied images, distances to outlines, and rays of a silhouette against the visual hull of
 others."""
 
 import dataclasses
@@ -20,7 +20,7 @@ from tests.helpers.scenes import make_batch
 
 
 def matted():
-    """Photographs of known colours, premultiplied by shares that include 0 and 1."""
+    """Images of known colours, premultiplied by mattes that include 0 and 1."""
     batch = make_batch(2, 3)
     generator = torch.Generator().manual_seed(2)
     colors, share = (
@@ -32,8 +32,7 @@ def matted():
 
 
 def test_colors_are_those_before_premultiplication():
-    """Where nothing of the subject shows, the photograph stays;
-    noise of a file gives no colour above 1."""
+    """Pixels with a matte of 0 are unchanged, and rounding errors of a file give no colour above 1."""
     colors, batch = matted()
     shown = (batch.alpha > 0)[:, :, None]
     found = surface_colors(batch)
@@ -46,7 +45,7 @@ def test_colors_are_those_before_premultiplication():
 
 
 def test_without_a_matte_nothing_changes():
-    """Binary masks lose nothing: the very photographs, and masks as shares."""
+    """With binary masks, images are returned unchanged and masks as shares."""
     _, batch = matted()
     plain = dataclasses.replace(batch, alpha=None)
     assert surface_colors(plain) is plain.images
@@ -56,7 +55,7 @@ def test_without_a_matte_nothing_changes():
 
 
 def test_masks_grow_to_what_shows_enough_of_the_subject():
-    """None leaves the matte out."""
+    """Masks follow a threshold of the matte; None drops the matte."""
     _, batch = matted()
     grown = with_matte(batch, 0.125)
     assert torch.equal(grown.masks, batch.alpha > 0.125)
@@ -67,8 +66,7 @@ def test_masks_grow_to_what_shows_enough_of_the_subject():
 
 
 def test_the_outline_runs_half_way_between_pixels():
-    """Distances are those to the nearest pixel on the other side,
-    found by going through all pairs."""
+    """Distances equal those to the nearest pixel on the other side, found by brute force."""
     mask = np.random.default_rng(0).uniform(size=(14, 11)) < 0.5
     places = np.argwhere(np.ones_like(mask))
     apart = cdist(places, places)
@@ -83,8 +81,7 @@ def test_without_an_outline_all_is_infinitely_far(value):
 
 
 def test_soft_outlines_are_found_to_fractions_of_a_pixel():
-    """Of a disc, from the shares of its pixels;
-    where it is cut off straight there is no soft pixel."""
+    """Distances of a disc from its matte, also where a straight cut leaves no fractional pixel."""
     fine = np.hypot(*((np.indices((320, 320)) + 0.5) / 8 - 20.3)) < 12.4
     matte = fine.reshape(40, 8, 40, 8).mean((1, 3))
     expected = 12.4 - np.hypot(*(np.indices((40, 40)) + 0.5 - 20.3))
@@ -100,7 +97,8 @@ def test_soft_outlines_are_found_to_fractions_of_a_pixel():
 
 
 def camera(turn, cells):
-    """Intrinsics of a photograph of ``cells`` x ``cells``, 4 m from the origin, turned around it."""
+    """Intrinsics of an image of ``cells`` x ``cells``, and extrinsics 4 m from the origin, rotated around
+    it."""
     sine, cosine = np.sin(turn), np.cos(turn)
     extrinsics = np.eye(4)
     extrinsics[:3] = [[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 4]]
@@ -109,7 +107,8 @@ def camera(turn, cells):
 
 @pytest.mark.parametrize(("row", "agrees"), [(24, True), (19, False)])
 def test_rays_pass_the_middle_of_cells(row, agrees):
-    """Cells as large as eight of the others' hull, above whose row the ray through their corner lies."""
+    """Cells are eight times as large as those of the hull, which lies above the row of the ray through
+    their corner."""
     mask = np.zeros((8, 8), bool)
     mask[3, 3:5] = True
     others = []

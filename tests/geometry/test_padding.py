@@ -1,4 +1,4 @@
-"""Padding keeps geometry and loses nothing."""
+"""Padding keeps geometry, and cropping undoes it."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ def cameras(b, v, height, width):
 
 
 def boxes(b, v, height, width, seed=0):
-    """Random rectangles as masks, some of them touching the border."""
+    """Random rectangles as masks, some of which touch the border."""
     generator = torch.Generator().manual_seed(seed)
     masks = torch.zeros(b, v, height, width, dtype=torch.bool)
     for index in range(b * v):
@@ -28,8 +28,8 @@ def boxes(b, v, height, width, seed=0):
     [((512, 512), -3, -3, (518, 518)), ((360, 640), -2, -2, (364, 644)), ((41, 27), 0, 0, (42, 28))],
 )
 def test_padding_is_centred_and_undone(size, top, left, padded):
-    """512 gets 3 pixels on each side as in the authors' release;
-    a single pixel goes below and right."""
+    """512 gets 3 pixels on each side as in the authors' release; an odd pixel goes to the bottom and
+    right."""
     alpha = torch.rand(1, 2, *size)
     batch = Batch(torch.rand(1, 2, 3, *size), boxes(1, 2, *size), cameras(1, 2, *size), alpha=alpha)
     padding = pad_to_patches(batch.masks, 14)
@@ -51,7 +51,7 @@ def test_padding_is_centred_and_undone(size, top, left, padded):
 
 @pytest.mark.parametrize("size", [(41, 27), (50, 60)])
 def test_gaussians_are_named_by_pixels_of_the_photograph(size):
-    """The index of each pixel in the padded image becomes that in the photograph."""
+    """Pixel indices in the padded image become those in the unpadded one."""
     padding = pad_to_patches(torch.zeros(1, 1, *size, dtype=torch.bool), 14)
     rows, columns = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
     inside = ((rows - padding.top) * padding.width + columns - padding.left).flatten()

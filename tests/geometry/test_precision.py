@@ -1,5 +1,5 @@
-"""Precisions: what rounds products and convolutions of float32 numbers on CUDA,
-set and read without it."""
+"""Precisions: PyTorch's switches for rounding float32 products and convolutions on CUDA, which can be set
+and read without a GPU."""
 
 import warnings
 
@@ -62,7 +62,7 @@ def convolutions_alone():
 
 @pytest.mark.parametrize("setting", [lambda: None, medium, everything, convolutions_alone])
 def test_exact_rounds_neither_products_nor_convolutions_on_cuda(setting):
-    """PyTorch's default rounds convolutions there; whatever was set comes back."""
+    """PyTorch rounds convolutions by default; the previous state is restored."""
     setting()
     before = state()
     assert rounds_products("cuda")
@@ -77,7 +77,7 @@ def test_exact_rounds_neither_products_nor_convolutions_on_cuda(setting):
 
 @pytest.mark.parametrize("setting", [lambda: None, medium])
 def test_older_switches_can_be_read_inside_and_come_back(setting):
-    """Other packages read them, and PyTorch refuses that where they contradict the newer ones."""
+    """Other packages read the older switches, which PyTorch rejects if they contradict the newer ones."""
     setting()
     before = by_older_switches()
     with exact("cuda"):
@@ -91,7 +91,7 @@ def test_older_switches_can_be_read_inside_and_come_back(setting):
 
 
 def test_float32_is_exact_and_tf32_is_refused_on_a_cpu():
-    """``precision=float32`` has no convolutions in TF32 on CUDA."""
+    """``precision=float32`` uses no TF32 in convolutions on CUDA; TF32 is rejected on a CPU."""
     with precision_of("float32", CUDA):
         assert not rounds_products("cuda")
     with pytest.raises(InputError, match="precision: expected tf32 on CUDA only; found 'cpu'"):
@@ -99,7 +99,8 @@ def test_float32_is_exact_and_tf32_is_refused_on_a_cpu():
 
 
 def test_products_round_where_convolutions_do_which_is_said_once():
-    """PyTorch's default on CUDA rounds convolutions alone; what was set comes back."""
+    """With PyTorch's default on CUDA, TF32 in convolutions alone, products use TF32 too, with one
+    warning; the state is restored."""
     _say_rounding.cache_clear()
     before = state()
     with pytest.warns(UserWarning, match="precision=inherit: factors of products are rounded to TF32"):
@@ -111,7 +112,7 @@ def test_products_round_where_convolutions_do_which_is_said_once():
 
 
 def _entered(name):
-    """The state of the switches inside."""
+    """State of the switches within a context."""
     with precision_of(name, CUDA):
         return state()
 
@@ -122,7 +123,7 @@ def float32_alone():
 
 @pytest.mark.parametrize("setting", [medium, everything, float32_alone])
 def test_what_a_process_has_chosen_is_inherited(setting):
-    """Such as float32 in convolutions, too, by ``trainer.precision=32-true``."""
+    """A chosen precision is kept, such as float32 in convolutions by ``trainer.precision=32-true``."""
     setting()
     before = state()
     assert _entered("inherit") == before
@@ -130,7 +131,7 @@ def test_what_a_process_has_chosen_is_inherited(setting):
 
 @pytest.mark.parametrize("kind", ["model=paper", "model=hull"])
 def test_rounded_weights_give_the_same_numbers_as_rounding_at_each_call(kind):
-    """Half the memory, and no kernel that casts a weight."""
+    """Stored half-precision weights take half the memory and need no kernels that cast them."""
     model, batch = make_model(kind).eval(), make_batch(1, 2, 28, 42)
     found, casts = [], []
     for _ in range(2):
@@ -145,7 +146,7 @@ def test_rounded_weights_give_the_same_numbers_as_rounding_at_each_call(kind):
 
 
 class Casts(TorchDispatchMode):
-    """Counts casts."""
+    """Counts operators that cast."""
 
     count = 0
 
@@ -155,7 +156,7 @@ class Casts(TorchDispatchMode):
 
 
 def test_a_training_in_tf32_leaves_nothing_to_the_next_one_of_its_process():
-    """Runs of a sweep share a process; ``32-true`` is float32 in convolutions, too."""
+    """Runs of a sweep share a process; with ``32-true``, convolutions are in float32, too."""
     for precision, rounds in (("32-true", False), ("tf32", True), ("32-true", False)):
         TrainerOptions(accelerator="cpu", precision=precision, max_steps=1).build(logger=False)
         assert rounds_products("cuda") == rounds

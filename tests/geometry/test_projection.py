@@ -1,4 +1,4 @@
-"""Between pixels and the world, and values of maps at pixels, against SciPy."""
+"""Projection, unprojection and bilinear sampling, against products of matrices and SciPy."""
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from tests.helpers.scenes import CENTER, ring
 
 
 def test_the_inverse_of_intrinsics_is_the_inverse_of_the_matrix():
-    """Focal lengths of two axes, a skew and a principal point, all different."""
+    """Focal lengths, skew and principal point are all different."""
     intrinsics = torch.tensor(
         [[[900.0, 3.0, 250.0], [0.0, 800.0, 260.0], [0.0, 0.0, 1.0]]], dtype=torch.float64
     )
@@ -20,7 +20,8 @@ def test_the_inverse_of_intrinsics_is_the_inverse_of_the_matrix():
 
 
 def test_projection_is_the_product_of_matrices_and_unprojection_its_inverse():
-    """Homogeneous coordinates in float64, a camera with a skew for each point, turned and moved."""
+    """Against homogeneous coordinates in float64, with a rotated and translated camera with skew for each
+    point."""
     generator = torch.Generator().manual_seed(0)
     n, options = 50, {"dtype": torch.float64, "generator": generator}
     intrinsics = torch.eye(3, dtype=torch.float64).repeat(n, 1, 1)
@@ -43,7 +44,7 @@ def test_projection_is_the_product_of_matrices_and_unprojection_its_inverse():
 
 
 def test_resized_cameras_see_points_at_the_same_share_of_the_photograph():
-    """Rows by the height and columns by the width, of photographs that are not square."""
+    """Rows scale with the height and columns with the width of images that are not square."""
     cameras = ring(1, 2, 40, 64)
     points = CENTER + 0.2 * torch.randn(7, 3, generator=torch.Generator().manual_seed(0))
 
@@ -72,12 +73,12 @@ def test_sampling_is_bilinear_and_0_outside():
 
 
 def test_no_pixels_have_no_values():
-    """A batch without a Gaussian is observed like any other."""
+    """Sampling at no pixels returns no values, for a batch without Gaussians."""
     assert sample(torch.rand(2, 5, 4, 4), torch.zeros(0, 3).long(), torch.zeros(0, 3, 2)).shape == (0, 3, 5)
 
 
 def test_double_precision_is_kept():
-    """The map was chosen by a number in single precision: some of the next one came along."""
+    """Regression: indices of maps were single precision, which mixed in some of the next map."""
     maps = torch.zeros(3, 1, 4, 4, dtype=torch.float64)
     maps[1] = 1
     found = sample(maps, torch.tensor([0, 2]), torch.full((2, 2), 2.0, dtype=torch.float64))

@@ -1,5 +1,4 @@
-"""Quaternions against SciPy, directions of vectors of any length, and motions of cameras relative to one
-another."""
+"""Quaternions against SciPy, normalisation of vectors of any length, and relative motions of cameras."""
 
 import math
 
@@ -23,7 +22,7 @@ from tests.helpers.scenes import ring
 
 
 def test_quaternions_of_matrices_and_their_products():
-    """At half turns as well, where the real part is 0."""
+    """Includes half turns, whose real part is 0."""
     vectors = np.concatenate((np.random.default_rng(0).normal(size=(40, 3)), math.pi * np.eye(3)))
     matrices = torch.from_numpy(Rotation.from_rotvec(vectors).as_matrix())
     found = matrix_to_quaternion(matrices)
@@ -39,8 +38,8 @@ def test_quaternions_of_matrices_and_their_products():
 
 @pytest.mark.parametrize("length", [1e-30, 1e-20, 1.0, 1e19, 1e30])
 def test_a_direction_and_its_gradient_do_not_depend_on_the_length(length):
-    """Squares vanished below 5e-14, where the gradient became infinite,
-    and overflowed from 1e19 on."""
+    """Regression: squares vanished below 5e-14, where the gradient became infinite, and overflowed from
+    1e19 on."""
     vector = torch.tensor([0.48, -0.6, 0.64, 0.0])
     x = (vector * length).requires_grad_()
     y = unit(x)
@@ -51,7 +50,7 @@ def test_a_direction_and_its_gradient_do_not_depend_on_the_length(length):
 
 
 def test_zero_stays_zero_without_a_gradient():
-    """It has no direction, and its gradient must not become NaN."""
+    """0 has no direction, and its gradient must not be NaN."""
     x = torch.zeros(2, 4, requires_grad=True)
     y = unit(x, 0.1)
     y.sum().backward()
@@ -60,7 +59,7 @@ def test_zero_stays_zero_without_a_gradient():
 
 
 def test_a_gradient_is_bounded_where_that_is_asked_for():
-    """Near the zero quaternion one splat would own the whole clipped gradient."""
+    """Near the zero quaternion, a single splat would dominate the clipped gradient."""
     vector = torch.tensor([0.6, 0.8])
     for length in (1e-12, 1e-3, 0.1, 5.0):
         x = (vector * length).requires_grad_()
@@ -74,8 +73,8 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_what_cameras_share_is_taken_out_and_the_rest_stays():
-    """A turn, a shift, and a way along the optical axes that all have;
-    differences keep their size."""
+    """A common rotation, translation and shift along the optical axes are removed; differences keep their
+    size."""
     g = torch.Generator().manual_seed(0)
     axes = torch.nn.functional.normalize(torch.randn(2, 4, 3, generator=g), dim=-1)
     motions = torch.randn(2, 4, 6, generator=g)
@@ -89,8 +88,8 @@ def test_what_cameras_share_is_taken_out_and_the_rest_stays():
 
 
 def test_what_cameras_share_is_what_photographs_show():
-    """Left and right camera move along their axes, which shows little:
-    the others stay where they are."""
+    """The left and right cameras move along their optical axes, which is hardly visible: the others must
+    stay."""
     axes = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     motions = torch.zeros(4, 6)
     motions[:, 3] = torch.tensor([0.1, 0.0, -0.1, 0.0])
@@ -103,15 +102,14 @@ def test_what_cameras_share_is_what_photographs_show():
 
 
 def test_small_motions_turn_and_shift_points():
-    """A turn by a hundredth moves a point by that share of its distance from the axis;
-    shifts have a unit."""
+    """A rotation by 0.01 moves a point by that fraction of its distance from the axis; shifts have a unit."""
     rotation, shift = rigid(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.5]), length=2.0)
     point = rotation @ torch.tensor([1.0, 0.0, 0.0]) + shift
     torch.testing.assert_close(point, torch.tensor([1.0, 0.01, 1.0]), rtol=0, atol=1e-4)
 
 
 def test_cameras_that_moved_tell_their_motions():
-    """Also where the middle is a kilometre away from the world's origin."""
+    """Motions are recovered from the cameras, also a kilometre away from the world's origin."""
     middle = torch.tensor([1000.0, 1.0, -500.0], dtype=torch.float64)
     before = ring(1, 4, 42, 42).extrinsics[0].double()
     before[:, :3, 3] -= before[:, :3, :3] @ middle

@@ -12,8 +12,7 @@ from tests.method.heads.test_depth import PATCH, assert_points, make_tokens, squ
 
 
 def release_token_points(inverse, cameras, dtype):
-    """Token points of a padded 518 x 518 inverse depth whose cameras belong to the 512 x
-    512 inside."""
+    """Token points of a padded 518 x 518 inverse depth whose cameras are those of the inner 512 x 512."""
     padded = cameras.cropped(-3, -3, 518, 518)
     depth = inverse_linear(inverse)
     _, views = depth.shape[:2]
@@ -26,7 +25,7 @@ def release_token_points(inverse, cameras, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_token_points_match_the_release(dtype):
-    """World points of tokens must be those of the authors' code."""
+    """World points of tokens equal those of the authors' code."""
     inputs, cameras = square_cameras("depth2pts_token", dtype, 512)
     inverse = inputs["inv_depth"].repeat_interleave(14, -1).repeat_interleave(14, -2)
     points = release_token_points(inverse, cameras, dtype)
@@ -35,7 +34,7 @@ def test_token_points_match_the_release(dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_token_depth_matches_the_release(dtype):
-    """The sampled depth of a token must be that of the authors' code."""
+    """Sampled depths of tokens equal those of the authors' code."""
     inputs, cameras = square_cameras("token_depth_518", dtype, 512)
     points = release_token_points(inputs["inv_depth_518"], cameras, dtype)
     expected = fixture("token_depth_518", "out64", torch.float64)["token_points"]
@@ -44,7 +43,7 @@ def test_token_depth_matches_the_release(dtype):
 
 
 def test_subject_tokens_are_means_over_the_subjects_pixels():
-    """A token must not mix the background into its place and depth."""
+    """A token's position and depth do not mix in the background."""
     batch = make_batch(2, 3, 56, 42)
     depth = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(0)) + 1
     pixels, means, valid = subject_tokens(DepthMaps(depth, batch.masks, depth), PATCH)
@@ -60,7 +59,7 @@ def test_subject_tokens_are_means_over_the_subjects_pixels():
 
 
 def test_token_points_lie_on_the_subject_and_project_back():
-    """A token's point must project into its own patch."""
+    """A token's point projects into its own patch."""
     batch = make_batch(1, 3, 112, 112)
     tokens = make_tokens(batch)
     points = Unprojection()(DepthMaps(batch.depths, batch.masks, batch.depths), tokens, batch)
@@ -76,7 +75,7 @@ def test_token_points_lie_on_the_subject_and_project_back():
 
 
 def test_unprojection_of_kept_tokens_only():
-    """Points of packed tokens must be those of the same tokens in the full set."""
+    """Points of packed tokens equal those of the same tokens in the full set."""
     batch = make_batch(1, 2)
     tokens = make_tokens(batch)
     maps = DepthMaps(batch.depths, batch.masks, batch.depths)

@@ -1,5 +1,4 @@
-"""Cameras of a capture: corrected where photographs contradict one another,
-and otherwise left alone."""
+"""Refinement of a capture's cameras: corrected where images disagree, otherwise unchanged."""
 
 import dataclasses
 
@@ -22,27 +21,27 @@ RENDERER = Renderer(backend="cpu")
 
 @dataclasses.dataclass
 class Splats:
-    """What a model that knows the depths would predict with the cameras that it is given."""
+    """Stand-in for a model that knows the true depths and predicts with the cameras it is given."""
 
     gaussians: object
     depth: object
 
 
 def predictor(truth):
-    """Splats at the true depth along each photograph's rays, in the subject's frame of 1.8 m."""
+    """Splats at the true depth along the rays of each image, in the subject's frame of 1.8 m."""
     depths = (truth.depths.double() / Frame.of(truth).metre[:, None, None, None]).float()
     return lambda batch: Splats(splats_at(batch, depths, batch.masks, sigma=0.5), depths)
 
 
 def scene(batch=1, views=4, size=70):
-    """Photographs of painted ellipsoids, with their depths."""
+    """Images of textured ellipsoids with their depths."""
     cameras = ring(batch, views, size, size)
     images, masks, depths = painted_ellipsoid(cameras)
     return Batch(images, masks, cameras, depths=depths)
 
 
 def far_away(batch):
-    """The same in millimetres, kilometres from the world's origin."""
+    """The same scene in millimetres, kilometres from the world's origin."""
     poses = batch.cameras.extrinsics.double().clone()
     poses[..., :3, 3] *= 1000
     poses[..., :3, 3] -= poses[..., :3, :3] @ torch.tensor([3e6, 2e5, -1e6], dtype=torch.float64)
@@ -51,8 +50,7 @@ def far_away(batch):
 
 
 def contradiction(batch, truth):
-    """Reprojection error in pixels of surface points,
-    triangulated from where photographs show them."""
+    """Reprojection error in pixels of surface points, triangulated from their true pixels."""
     points = unproject_maps(truth.depths, truth.cameras)[truth.masks].double()[::7]
     lens, pose = truth.cameras.intrinsics[0, :, None].double(), truth.cameras.extrinsics[0, :, None].double()
     lenses, poses = (
@@ -75,9 +73,9 @@ def contradiction(batch, truth):
 
 @pytest.mark.parametrize(("views", "pixels", "seed"), [(3, 4.0, 2), (4, 2.0, 0), (4, 2.0, 1)])
 def test_views_agree_better(views, pixels, seed):
-    """The whole rig may stay where the errors have moved it; its cameras must fit one another.
+    """The rig as a whole may keep its errors, but its cameras must fit one another.
 
-    Three views, a third of a turn apart, have little surface in common: only large errors show.
+    Three views, a third of a turn apart, share little surface: only large errors are visible.
     """
     truth = scene(views=views)
     wrong = off(truth, pixels, (seed,))
@@ -93,8 +91,7 @@ def test_views_agree_better(views, pixels, seed):
 
 
 def test_focal_lengths_are_corrected_where_silhouettes_tell_them():
-    """One element has a lens that is too long, the other none:
-    only the first one's lenses change."""
+    """One element has a focal length that is too long, the other none: only the first one's lenses change."""
     truth = scene(batch=2)
     lenses = truth.cameras.intrinsics.clone()
     lenses[0, 1, [0, 1], [0, 1]] *= 1.08
@@ -110,8 +107,7 @@ def test_focal_lengths_are_corrected_where_silhouettes_tell_them():
 
 
 def test_exact_cameras_stay():
-    """A user who asks for it without need must not lose,
-    not even digits far from the world's origin."""
+    """Refining exact cameras must not lose accuracy, not even digits far from the world's origin."""
     truth = scene()
     for batch in (truth, far_away(truth)):
         found = CameraRefinement(2, predictor(truth), RENDERER)(batch)
@@ -121,7 +117,7 @@ def test_exact_cameras_stay():
 
 @pytest.mark.parametrize("is_exact", [False, True])
 def test_elements_are_corrected_as_if_alone(is_exact):
-    """A result must not depend on batch mates, be the cameras of one exact or not."""
+    """The result does not depend on batch mates, whether their cameras are exact or not."""
     truth = scene(batch=2, size=42)
     wrong = off(truth, seeds=(0, 5))
     if is_exact:
@@ -141,8 +137,7 @@ def test_elements_are_corrected_as_if_alone(is_exact):
 
 @pytest.mark.parametrize("views", [3, 4])
 def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch, views):
-    """The first element has exact cameras, the other ones that are off by pixels;
-    three views tell less."""
+    """The first element has exact cameras, the others' are off by pixels; three views constrain them less."""
     truth = scene(batch=2, views=views)
     poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 4.0, (0, 5)).cameras.extrinsics[1]))
     batch = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
@@ -159,7 +154,8 @@ def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch, 
 
 
 def test_a_camera_that_was_bumped_moves_alone():
-    """Three of four are exact: they stay to the bit, the fourth's error is not spread over them."""
+    """Three of four cameras are exact: they stay bit for bit, and the fourth's error is not spread over
+    them."""
     truth = scene()
     poses = truth.cameras.extrinsics.clone()
     poses[:, 1] = off(truth, 8.0, (4,)).cameras.extrinsics[:, 1]
@@ -173,7 +169,7 @@ def test_a_camera_that_was_bumped_moves_alone():
 
 
 def test_rounds_end_where_nothing_gets_better():
-    """Cameras that agree are predicted once, others until they do."""
+    """Consistent cameras take one prediction, others as many as help."""
     truth = scene(size=42)
     counts = []
     for batch in (truth, off(truth)):
@@ -185,7 +181,7 @@ def test_rounds_end_where_nothing_gets_better():
 
 
 def test_any_unit_and_origin():
-    """Millimetres and a far origin: the same motion in pixels."""
+    """Millimetres and a far origin give the same motion in pixels."""
     truth = scene(size=42)
     wrong = off(truth)
     expected = pixels_moved(wrong, CameraRefinement(1, predictor(truth), RENDERER)(wrong))
@@ -202,7 +198,7 @@ def test_no_rounds_are_refused():
 
 
 def test_a_view_is_compared_with_what_the_other_views_of_its_element_say():
-    """Its own Gaussians reproduce its photograph wherever its camera is."""
+    """A view's own Gaussians are left out, since they reproduce its image wherever its camera is."""
     truth = scene(batch=2, views=3, size=28)
     inside = Frame.of(truth).enter(truth)
     views = _views(predictor(truth)(inside), inside)

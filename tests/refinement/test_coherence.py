@@ -45,7 +45,7 @@ def figure(batch=1, views=4, size=126):
 
 
 def bumped(truth, off_by, seed):
-    """The batch with some cameras, the keys, off by up to so many pixels."""
+    """The batch with some cameras (keys) moved by up to the given pixels."""
     poses = truth.cameras.extrinsics.clone()
     for view, pixels in off_by.items():
         poses[:, view] = off(truth, pixels, (seed,)).cameras.extrinsics[:, view]
@@ -53,8 +53,7 @@ def bumped(truth, off_by, seed):
 
 
 def pixels_off(cameras, truth):
-    """How far surface points are from where they should be seen,
-    root mean square over all views."""
+    """Root mean square distance, over all views, between surface points and their true pixels."""
     points = unproject_maps(truth.depths, truth.cameras)[truth.masks][::5]
     seen = [
         project(points.expand(*each.extrinsics.shape[:2], -1, 3), *(m[:, :, None] for m in matrices))[0]
@@ -66,8 +65,8 @@ def pixels_off(cameras, truth):
 
 @pytest.mark.parametrize(("views", "pixels", "seed"), [(3, 6.0, 1), (4, 6.0, 0), (4, 6.0, 2), (5, 6.0, 3)])
 def test_silhouettes_correct_cameras(views, pixels, seed):
-    """Errors of pixels become errors of a fraction;
-    lenses hardly change, rotations are rotations."""
+    """Errors of pixels become fractions of a pixel; focal lengths hardly change, and rotations stay
+    rotations."""
     truth = figure(views=views)
     wrong = off(truth, pixels, (seed,))
     found, _, _ = coherent_cameras(wrong)
@@ -84,7 +83,7 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_exact_cameras_stay(shared):
-    """To the bit: silhouettes that explain one another give no reason to move; alone and as a rig."""
+    """Consistent silhouettes leave cameras unchanged bit for bit, alone and as a rig."""
     truth = instants() if shared else figure()
     found, _, distance = coherent_cameras(truth, shared=shared)
     assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
@@ -93,22 +92,22 @@ def test_exact_cameras_stay(shared):
 
 
 def second_is_off(pixels):
-    """Two elements, of which the first has exact cameras."""
+    """Two elements, the first with exact cameras."""
     truth = figure(batch=2)
     poses = torch.stack((truth.cameras.extrinsics[0], off(truth, pixels, (0, 5)).cameras.extrinsics[1]))
     return dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
 
 
 def test_distances_tell_exact_cameras_from_others():
-    """Those of the given cameras, in pixels, for each element."""
+    """Distances of the given cameras, in pixels per element, separate exact cameras from others."""
     _, _, distances = coherent_cameras(second_is_off(4.0))
     assert 0 <= distances[0] < 1.5e-4
     assert 3e-3 < distances[1] < 1
 
 
 def test_a_quick_look_tells_exact_cameras_from_others():
-    """Also ones that are off by a pixel or two, each element by itself;
-    nothing without an outline."""
+    """The quick check detects cameras off by a pixel or two, per element, and ignores images without an
+    outline."""
     batch = second_is_off(3.0)
     exact, wrong = contradiction(batch)[0]
     assert exact < 2e-3 < 4e-3 < wrong
@@ -137,7 +136,7 @@ def test_half_precision_of_others_changes_nothing():
 
 @pytest.mark.parametrize("matte", [0, 1])
 def test_no_outline_at_all_moves_nothing_and_says_nothing(matte):
-    """Photographs without masks must not pass for silhouettes that agree."""
+    """Images without masks must not pass for consistent silhouettes."""
     truth = figure()
     nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha + matte)
     found, _, distances = coherent_cameras(nothing)
@@ -147,7 +146,8 @@ def test_no_outline_at_all_moves_nothing_and_says_nothing(matte):
 
 @pytest.mark.parametrize("mask", [torch.zeros(126, 126), torch.ones(126, 126)])
 def test_a_silhouette_without_an_outline_says_nothing_wrong(mask):
-    """An empty one explains no ray and a full one every ray: cameras stay finite."""
+    """Cameras stay finite with an empty silhouette, which explains no ray, and a full one, which explains
+    all."""
     truth = figure()
     alpha = truth.alpha.clone()
     alpha[0, 1] = mask
@@ -158,7 +158,7 @@ def test_a_silhouette_without_an_outline_says_nothing_wrong(mask):
 
 
 def test_a_subject_may_go_on_beyond_a_photograph():
-    """A photograph that cuts the legs off contradicts nothing, as nobody knows what is below it."""
+    """An image that cuts off the legs contradicts nothing, since it shows nothing below its border."""
     truth = figure()
     cameras = dataclasses.replace(truth.cameras, height=90)
     images, masks, alpha = (part[..., :90, :] for part in (truth.images, truth.masks, truth.alpha))
@@ -168,8 +168,8 @@ def test_a_subject_may_go_on_beyond_a_photograph():
 
 
 def test_gradients_are_those_of_finite_differences():
-    """Of distances by small motions of points,
-    in a map that is smooth (a cone's slopes are constant)."""
+    """Derivatives of distances with respect to points, in a smooth map (a cone, whose slopes are
+    constant)."""
     truth = figure()
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
     u, v = torch.meshgrid(torch.arange(4 * 126.0), torch.arange(4 * 126.0), indexing="xy")
@@ -196,9 +196,9 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_a_step_follows_the_motion_that_took_cameras_away(monkeypatch):
-    """One camera moves by six pixels, sideways, but for what all share: most of it comes back.
+    """One camera moves sideways by six pixels, less the common motion: most of it is undone.
 
-    Silhouettes do not tell this from one camera that moved alone, so none may stay here.
+    Silhouettes cannot distinguish this from one camera that moved alone, so none may stay here.
     """
     truth = figure()
     pose = truth.cameras.extrinsics[0]
@@ -237,7 +237,7 @@ def test_where_all_are_off_all_move(views):
 
 
 def test_a_clear_culprit_is_named_and_one_of_two_is_not():
-    """Without opposite cameras the others may agree alike."""
+    """Without either of two opposite cameras, the others may agree equally well."""
     assert culprit([0.003, 1e-5, 0.002, 0.004]) == 1
     assert culprit([0.003, 8e-4, 0.002, 9e-4]) is None
     assert culprit([2e-5, 0.0, 3e-5, 1e-5]) is None
@@ -251,7 +251,7 @@ def with_zooms(truth, zooms):
 
 @pytest.mark.parametrize("zoomed", [1, 3])
 def test_a_wrong_focal_length_comes_back(zoomed):
-    """One lens is longer than it was: the others agree without it, and stay."""
+    """One focal length is too long: the others agree without it, and stay."""
     truth = figure()
     wrong = with_zooms(truth, torch.ones(4).index_fill(0, torch.tensor([zoomed]), 1.06))
     found, free, _ = coherent_cameras(wrong)
@@ -260,7 +260,7 @@ def test_a_wrong_focal_length_comes_back(zoomed):
 
 
 def test_focal_lengths_that_contradict_one_another_come_nearer(monkeypatch):
-    """Of all cameras: what photographs show of that is found, and is no motion."""
+    """All focal lengths are off: their observable part is recovered, and is not mistaken for a motion."""
     truth = figure()
     zoom = torch.tensor([1.0, 1.06, 1.0, 1.0])
     zoom = zoom / zoom.log().mean().exp()  # what all share, they do not show
@@ -273,8 +273,7 @@ def test_focal_lengths_that_contradict_one_another_come_nearer(monkeypatch):
 
 
 def test_a_ray_is_looked_up_in_the_other_silhouettes():
-    """The depth is the least one in the others,
-    at a point of the ray that no other point of it beats."""
+    """The depth is the least one in the other silhouettes, and no other point of the ray exceeds it."""
     truth = figure()
     outlines = Outlines.of(truth.alpha[0])
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
@@ -291,8 +290,7 @@ def test_a_ray_is_looked_up_in_the_other_silhouettes():
 
 
 def test_phases_weigh_rays_by_what_they_make_small():
-    """First, only rays that miss count; then,
-    only those about as deep as in their own silhouette."""
+    """First only rays that miss have weight, then only those about as deep as in their own silhouette."""
     first, second = coherence._MEET, coherence._LIE
     depth = torch.tensor([3.0, -0.5, -4.0])
     distances = first.distances(depth, torch.ones(3))
@@ -307,7 +305,7 @@ def test_phases_weigh_rays_by_what_they_make_small():
 
 
 def instants(count=3, views=4, size=98):
-    """The figure at several places of one world, as the elements of a batch in one frame."""
+    """The figure at several positions in one world, as elements of a batch in one frame."""
     cameras, found = ring(1, views, size, size), []
     for number in range(count):
         moved = torch.eye(4)
@@ -325,8 +323,7 @@ def instants(count=3, views=4, size=98):
 
 
 def corners_off(cameras, truth):
-    """Pixels by which a box around all instants is seen elsewhere in the first's views,
-    root mean square."""
+    """Root mean square error in pixels of a box around all instants, in the first instant's views."""
     corners = HEIGHT / 3 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     seen = [
         project(corners.expand(4, -1, -1), each.intrinsics[0][:, None], each.extrinsics[0][:, None])[0]

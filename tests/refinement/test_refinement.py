@@ -1,4 +1,4 @@
-"""Refinement: nearer to photographs, better from elsewhere, within its bounds."""
+"""Refinement brings renders nearer to the images, improves other views, and stays within its bounds."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ RENDERER = Renderer(backend="cpu")
 
 
 def scene(batch=1, views=4, size=56):
-    """Photographs, dull and thin splats at the true depth, and a view between the inputs."""
+    """Images, dull and thin splats at the true depth, and a view between the inputs."""
     around = ring(batch, 2 * views, size, size)
     images, masks, _ = painted_ellipsoid(around[:, ::2])
     inputs = Batch(images, masks, around[:, ::2])
@@ -29,19 +29,19 @@ def scene(batch=1, views=4, size=56):
 
 
 def at_true_depth(batch):
-    """A prediction: dull and thin splats of all inputs that it is given."""
+    """A stand-in for a prediction: dull and thin splats at the true depth for all given inputs."""
     splats = splats_at(batch, painted_ellipsoid(batch.cameras)[2], batch.masks, sigma=0.25)
     return dataclasses.replace(splats, colors=0.95 * splats.colors)
 
 
 def quality(gaussians, cameras, images, masks=None):
-    """PSNR, of the masks' boxes where there are any."""
+    """PSNR, in the masks' boxes if there are masks."""
     region = None if masks is None else box_of(masks.flatten(0, 1))
     return float(psnr(RENDERER(gaussians, cameras).image.flatten(0, 1), images.flatten(0, 1), region).mean())
 
 
 def test_a_view_that_nobody_saw_gets_better():
-    """It is for other views that a user refines; the inputs' PSNR must be what is reported."""
+    """A view that is not an input improves, and the reported PSNR of the inputs is right."""
     splats, inputs, between = scene()
     target = painted_ellipsoid(between)[0]
     refinement = Refinement(15, RENDERER)
@@ -60,7 +60,7 @@ def test_a_view_that_nobody_saw_gets_better():
 
 
 def test_changes_are_bounded():
-    """What no photograph shows must stay near the prediction, however long it is refined."""
+    """Parts that no image shows stay near the prediction, however long the refinement."""
     splats, inputs, _ = scene(size=42)
     splats.opacities[:2] = torch.tensor((0.0, 1.0))  # which no step of their logit could leave
     noise = dataclasses.replace(inputs, images=torch.rand(inputs.images.shape) * inputs.masks[:, :, None])
@@ -76,8 +76,7 @@ def test_changes_are_bounded():
 
 
 def test_fine_detail_comes_back_and_nothing_else():
-    """Splats that overlap blur a texture; other exposures and what is beside the subject must not
-    become colours."""
+    """Overlapping splats blur a texture; different exposures and the background must not change colours."""
     splats, inputs, _ = scene(views=2, size=112)
     checks = (torch.arange(112)[:, None] + torch.arange(112)) % 2 * 0.3 + 0.4
     textured = dataclasses.replace(inputs, images=checks * inputs.masks[:, :, None].expand_as(inputs.images))
@@ -106,7 +105,8 @@ def test_fine_detail_comes_back_and_nothing_else():
 
 
 def test_the_input_that_is_held_out_takes_no_part():
-    """The others predict again: a prediction that has seen it says nothing of other views."""
+    """The held-out input is excluded from the new prediction, too, or its PSNR would mean nothing for
+    other views."""
     splats, inputs, _ = scene(size=28)
     refinement, given = Refinement(2, RENDERER), []
 
@@ -125,7 +125,7 @@ def test_the_input_that_is_held_out_takes_no_part():
 
 
 def test_some_photographs_of_a_batch_are_a_batch():
-    """Everything that belongs to a photograph goes with it."""
+    """Selecting views selects everything that belongs to them."""
     _, inputs, _ = scene(size=28)
     names = dataclasses.replace(inputs, alpha=inputs.masks.float(), views=(("a", "b", "c", "d"),))
     part = names.of_views([2, 0])
@@ -136,8 +136,7 @@ def test_some_photographs_of_a_batch_are_a_batch():
 
 
 def test_what_is_beside_the_subject_takes_no_part():
-    """Photographs may come with their background;
-    those with a matte are premultiplied by it, on black."""
+    """Images may contain their background; those with a matte are premultiplied by it, on black."""
     splats, inputs, _ = scene(size=42)
     room = dataclasses.replace(inputs, images=torch.where(inputs.masks[:, :, None], inputs.images, 0.7))
     matte = dataclasses.replace(inputs, alpha=inputs.masks.float())
@@ -149,7 +148,7 @@ def test_what_is_beside_the_subject_takes_no_part():
 
 @pytest.mark.parametrize("views", [2, 3])
 def test_few_inputs_are_refined_without_one_that_is_held_out(views):
-    """Two that are left show too little of a person for a prediction that says anything."""
+    """Three or fewer inputs have none held out, since two show too little of a person."""
     splats, inputs, _ = scene(views=views, size=28)
     refinement = Refinement(3, RENDERER)
     report = refinement.report(splats, refinement(splats, inputs), inputs, at_true_depth)
@@ -158,7 +157,7 @@ def test_few_inputs_are_refined_without_one_that_is_held_out(views):
 
 
 def test_elements_are_refined_as_if_alone():
-    """A result must not depend on batch mates."""
+    """The result does not depend on batch mates."""
     splats, inputs, _ = scene(batch=2, size=28)
     together = Refinement(6, RENDERER)(splats, inputs)
     assert together.splits == splats.splits
@@ -170,7 +169,7 @@ def test_elements_are_refined_as_if_alone():
 
 
 def test_what_cannot_be_refined_is_refused():
-    """Splats of a file belong to no pixel of these photographs."""
+    """Splats from a file have no pixels in these images."""
     splats, inputs, _ = scene(size=28)
     with pytest.raises(InputError, match="refine: expected Gaussians of the inputs' pixels"):
         Refinement(1, RENDERER)(dataclasses.replace(splats, image=None), inputs)
@@ -179,7 +178,7 @@ def test_what_cannot_be_refined_is_refused():
 
 
 def test_silhouettes_alone_make_what_is_too_thin_denser():
-    """A black subject on black: its colours say nothing, its silhouette says how opaque it is."""
+    """For a black subject on black, colours say nothing, but the silhouette determines opacity."""
     splats, inputs, _ = scene(size=28)
     black = dataclasses.replace(inputs, images=torch.zeros_like(inputs.images))
     thin = dataclasses.replace(
@@ -190,7 +189,7 @@ def test_silhouettes_alone_make_what_is_too_thin_denser():
 
 
 def test_footprints_are_of_each_photographs_own_mean_focal_length():
-    """A lens that is longer along one axis, in one view alone."""
+    """One view has a longer focal length along one axis."""
     splats, inputs, _ = scene(size=28)
     lenses = inputs.cameras.intrinsics.clone()
     lenses[0, 1, 0, 0] *= 4
