@@ -1,4 +1,4 @@
-"""CUDA graphs: on which streams and in which memory they are made, and what a failure leaves."""
+"""CUDA-graph capture: its streams and memory, and the state after a failure."""
 
 from contextlib import contextmanager
 
@@ -11,11 +11,11 @@ from ghgs_lit.execution.graphs import GraphCache
 
 
 class Graphs:
-    """Stand-ins for CUDA's streams and graphs, which note what happens to them.
+    """Stand-ins for CUDA's streams and graphs, which record events.
 
     Args:
-        log: gets what happens.
-        end_fails: ending a recording that failed fails, too, as where CUDA has ended it.
+        log: list of events.
+        end_fails: whether ending a failed capture fails as well, as when CUDA has already ended it.
     """
 
     def __init__(self, log, end_fails=False):
@@ -94,8 +94,8 @@ def graphs(monkeypatch):
 
 
 def test_graphs_are_made_as_pytorch_documents(graphs):
-    """A call on a side stream, then the recording there; all on one stream, whose memory they share,
-    and in one pool as long as a graph of it is there."""
+    """A call on a side stream, then the capture there; all on one stream, and in one memory pool as long
+    as one of its graphs exists."""
     log = []
     graphs(log)
     cuda = CudaGraphs()
@@ -111,8 +111,8 @@ def test_graphs_are_made_as_pytorch_documents(graphs):
 
 @pytest.mark.parametrize("end_fails", [True, False])
 def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails):
-    """PyTorch's context does not restore the stream where it cannot end a recording. What was cast
-    meanwhile was not computed, and memory that was written is as before."""
+    """PyTorch's context does not restore the stream if it cannot end a capture. Casts made meanwhile were
+    not computed, and written memory is restored."""
     log, calls, weight = [], [], torch.ones(3)
     stand_in = Graphs(log, end_fails)
     stand_in.install(monkeypatch)

@@ -1,4 +1,4 @@
-"""Captured calls: what is replayed, what is rejected, and what makes another shape bucket."""
+"""Captured calls: replays, rejections, and what distinguishes shape buckets."""
 
 import copy
 import dataclasses
@@ -36,7 +36,7 @@ def numbers(seed, *shape):
 
 
 def work(values):
-    """Views, writes to its own memory, sorting and several results of which two are one."""
+    """Views, in-place writes to its own memory, sorting, and several results, two of which are the same."""
     a, b = values
     table = torch.zeros_like(a)
     table[:, 1:] = a[:, 1:] * 2
@@ -47,7 +47,7 @@ def work(values):
 
 
 def test_other_values_give_what_an_eager_call_gives():
-    """From the third call on nothing but the graph runs, and results keep their memory."""
+    """From the third call on only the graph runs, and results are not overwritten."""
     cache, calls = made(), []
 
     def counted(values):
@@ -61,12 +61,12 @@ def test_other_values_give_what_an_eager_call_gives():
         assert torch.equal(result["order"][0], wanted["order"][0])
         assert result["order"][1:] == (3, "name")
         assert result["best"] is result["same"]
-    assert len(calls) == 3  # eagerly, once before the capture, and for it
+    assert len(calls) == 3  # eager, warm-up before the capture, and capture
     assert cache.counts == {"eager": 1, "captured": 1, "replayed": 4}
 
 
 def test_dataclasses_come_back_with_what_they_keep():
-    """Values beside fields are inputs like fields: captured functions may depend on them."""
+    """Attributes that are not fields are inputs like fields: captured functions may depend on them."""
     cache = made()
 
     def moved(cameras):
@@ -83,7 +83,7 @@ def test_dataclasses_come_back_with_what_they_keep():
 
 
 def test_what_a_call_keeps_is_computed_by_the_graph():
-    """The call before it has computed it, too, of inputs that are not those to come."""
+    """Values cached by the call before the capture belong to its inputs, and must be recomputed."""
     cache = made()
 
     def shifted(batch):
@@ -128,7 +128,7 @@ NAMES = ["shape", "dtype", "number", "type", "structure", "key", "autocast", "gr
 
 @pytest.mark.parametrize("name", NAMES)
 def test_each_difference_is_another_bucket(name):
-    """What a graph fixes must be the same."""
+    """Everything that a graph fixes must be equal."""
     cache = made()
     for each in ("usual", "usual", name, "usual"):
         case = other_bucket(each)
@@ -138,7 +138,7 @@ def test_each_difference_is_another_bucket(name):
 
 
 def test_rounding_of_products_is_another_bucket():
-    """TF32 chooses other kernels."""
+    """TF32 selects other kernels."""
     kinds = []
     for name in ("usual", "rounding"):
         with other_bucket(name)["around"]:
@@ -182,7 +182,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("function", REFUSED)
 def test_what_cannot_be_replayed_stays_eager(function):
-    """A warning names the reason once, and results are right."""
+    """A warning gives the reason once, and results are right."""
     cache = made()
     cache(function, (numbers(0), numbers(1)))
     with pytest.warns(UserWarning, match=REFUSED[function]):
@@ -199,7 +199,7 @@ def test_what_cannot_be_replayed_stays_eager(function):
 
 
 def refusal(function, values):
-    """Why a function is not captured on the pretend device."""
+    """Reason why a function is not captured on the pretend device."""
     cache = GraphCache(backend=OperatorBackend(), eager=0)
     with pytest.warns(UserWarning, match="not captured"):
         cache(function, values)
@@ -207,8 +207,7 @@ def refusal(function, values):
 
 
 def test_copies_from_the_host_are_refused():
-    """A replay would read memory that holds something else by then;
-    a waiting copy fails on CUDA."""
+    """A replay would read host memory whose content has changed; a synchronous copy fails on CUDA."""
     cache = GraphCache(backend=OperatorBackend())
     with pretend_device():
         values = numbers(0).to(DEVICE)
@@ -223,7 +222,7 @@ def test_copies_from_the_host_are_refused():
 
 
 def test_tensors_of_other_devices_are_not_captured():
-    """Graphs are of one type of device; all else is eager, without a warning."""
+    """Graphs belong to one type of device; other calls are eager, without a warning."""
     cache = GraphCache(backend=OperatorBackend())
     for _ in range(3):
         cache(work, (numbers(0), numbers(1)))
@@ -231,7 +230,7 @@ def test_tensors_of_other_devices_are_not_captured():
 
 
 def test_an_unhashable_value_is_eager():
-    """It cannot be compared with what was captured."""
+    """It cannot be compared with that of the captured call."""
     cache = made()
     for _ in range(3):
         cache(lambda values: values[0] + 1, (numbers(0), {"a": {1}}))
@@ -239,9 +238,9 @@ def test_an_unhashable_value_is_eager():
 
 
 def test_the_least_recently_used_graph_makes_room():
-    """And is captured again when its bucket returns."""
+    """An evicted graph is captured again when its bucket returns."""
     cache = made(limit=2)
-    for size in (1, 1, 2, 2, 1, 3, 3):  # 2 leaves
+    for size in (1, 1, 2, 2, 1, 3, 3):  # 2 is evicted
         cache(lambda x: x + 1, numbers(0, size))
     assert cache.counts == {"eager": 3, "captured": 3, "replayed": 1}
     cache(lambda x: x + 1, numbers(0, 1))
@@ -265,7 +264,7 @@ def test_memory_of_caches_is_kept():
 
 
 def test_weights_that_change_in_place_are_read():
-    """Training writes them where they are; after they have moved, all is captured again."""
+    """Training updates weights in place; if they move, everything is captured again."""
     cache, layer = made(), nn.Linear(3, 2)
     for seed in range(3):
         cache(layer, numbers(seed))
@@ -279,7 +278,7 @@ def test_weights_that_change_in_place_are_read():
 
 
 def test_casts_of_weights_are_captured_with_what_reads_them():
-    """Autocast shares casts within a context; a replay casts the weights again."""
+    """Autocast shares casts within a context; a replay must cast the weights again."""
     cache, layer = made(), nn.Linear(3, 2)
     with bfloat16():
         for seed in range(3):
@@ -290,7 +289,7 @@ def test_casts_of_weights_are_captured_with_what_reads_them():
 
 
 def test_where_memory_is_lacking_graphs_make_room():
-    """Those of all caches; without any, or where a call has written, the error stands."""
+    """Graphs of all caches are freed; without any, or if a call has written, the error is raised."""
     holder, other = made(), made()
     for seed in range(2):
         holder(work, (numbers(seed), numbers(seed)))
@@ -307,7 +306,7 @@ def test_where_memory_is_lacking_graphs_make_room():
     failures = iter([True, False, True])
     with pytest.warns(UserWarning, match="too little memory"):
         assert torch.equal(other(large, numbers(0)), numbers(0) + 1)
-    with pytest.raises(torch.OutOfMemoryError):  # nothing is left that could make room
+    with pytest.raises(torch.OutOfMemoryError):  # no graph is left to free
         other(large, numbers(0), key="another")
     assert not holder._graphs
     for seed in range(3):
@@ -316,7 +315,7 @@ def test_where_memory_is_lacking_graphs_make_room():
 
 
 def test_a_capture_that_finds_too_little_memory_is_let_go_first():
-    """The call that follows needs the memory that the error would keep. Graphs make room, and later
+    """The call that follows needs the memory that the error would keep alive. Graphs are freed, and later
     calls are captured again."""
     holder, cache, alive, calls = made(), made(), [], []
     for seed in range(2):
@@ -341,11 +340,11 @@ def test_a_capture_that_finds_too_little_memory_is_let_go_first():
 
 
 class Held:
-    """Memory of a call that fails."""
+    """Memory held by a call that fails."""
 
 
 def test_what_returns_too_late_is_not_captured():
-    """Graphs would replace each other before they are replayed."""
+    """Graphs would evict each other before they are replayed."""
     cache = GraphCache(limit=2, backend=OperatorBackend("cpu"), recent=2)
     for _ in range(3):
         for size in (1, 2, 3):

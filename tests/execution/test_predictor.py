@@ -21,7 +21,7 @@ from tests.helpers.pretend_device import DEVICE, pretend_device
 
 @pytest.fixture(autouse=True)
 def there():
-    """Without a gradient, on the pretend device, on one thread."""
+    """Run without a gradient, on the pretend device, on one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with torch.no_grad(), pretend_device() as log, drawing_nothing():
@@ -37,8 +37,7 @@ def capturing(*overrides):
 
 
 def scene(share=0.15, color=1.0, views=2, holes=0, size=28):
-    """Photographs of an ellipsoid that covers a ``share`` of them,
-    with holes in the middle of a mask."""
+    """Images of an ellipsoid that covers a fraction ``share``, with holes in the middle of a mask."""
     batch = ellipsoid_batch(share, views, size, 1)
     batch.masks[0, 0, 14, 14 : 14 + holes] = False
     return dataclasses.replace(batch, images=color * batch.images).to(DEVICE)
@@ -55,14 +54,14 @@ def eager(predictor, batch):
 
 
 def differs(found, wanted):
-    """Largest difference of two predictions' Gaussians."""
+    """Largest difference between the Gaussians of two predictions."""
     pairs = ((getattr(each.gaussians, name).cpu() for each in (found, wanted)) for name in ATTRIBUTES)
     return max(float((one - other).abs().max()) for one, other in pairs)
 
 
 @pytest.mark.parametrize("kind", [("model=paper", "skip=fast"), ("model=recurrent",)], ids=str)
 def test_other_scenes_of_a_bucket_are_predicted_as_eagerly(kind):
-    """Other masks and colours; as many Gaussians as each has pixels."""
+    """With other masks and colours, and as many Gaussians as each scene has pixels."""
     model = capturing(*kind)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (3, 1.0)):
         batch = scene(holes=holes, color=color)
@@ -74,19 +73,20 @@ def test_other_scenes_of_a_bucket_are_predicted_as_eagerly(kind):
 
 
 def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
-    """Both the copies and full size, which starts from their depths and tokens, are replayed."""
+    """Both are replayed: the stages for the copies, and at full size, which start from their depths and
+    tokens."""
     model = capturing("model=recurrent", "rounds.height=14")
     for color in (1.0, 0.9, 0.8, 0.7):
         batch = scene(0.3, color)
         assert model.needs_copies(batch)
         found, wanted = model(batch), eager(model, batch)
         close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
-    # What precedes the plan, the stages for copies, and those at full size.
+    # Work before the plan, the stages for copies, and those at full size.
     assert counts(model) == {"eager": 3, "captured": 3, "replayed": 6}
 
 
 def test_what_changes_a_prediction_is_another_bucket():
-    """Sizes, the number of rounds, what the encoder sees."""
+    """Sizes, the number of rounds, and the encoder's choice of patches."""
     model = capturing("model=recurrent", "encoder.semantic=null")
     for _ in range(2):
         model(scene())
@@ -95,11 +95,11 @@ def test_what_changes_a_prediction_is_another_bucket():
     assert len(found.rounds) == 2
     model(scene(views=3))
     model(scene(0.3))
-    assert counts(model) == {"captured": 2, "eager": 6, "replayed": 2}  # what precedes the plan
+    assert counts(model) == {"captured": 2, "eager": 6, "replayed": 2}  # work before the plan
 
 
 def test_what_is_watched_or_has_a_gradient_is_called():
-    """Watchers observe every stage, and a graph has no gradient."""
+    """Watchers must observe every stage, and a graph has no gradient."""
     model = capturing("model=paper")
     for _ in range(2):
         model(scene())
@@ -111,12 +111,12 @@ def test_what_is_watched_or_has_a_gradient_is_called():
     eager(model, scene())
     model.model.train()
     model(scene())
-    # What precedes the plan is replayed with a gradient, and of another bucket in training.
+    # Work before the plan is replayed even with gradients, and from another bucket in training.
     assert counts(model) == before | {"replayed": 1, "eager": 3}
 
 
 def test_too_little_room_is_followed_by_another_capture(monkeypatch):
-    """The first, which would have as little room again, is forgotten."""
+    """The first graph, whose capacity would be too small again, is dropped."""
     model, batch = capturing("model=recurrent"), scene()
     for _ in range(3):
         wanted = model(batch)
@@ -134,7 +134,7 @@ def replaced_storage(model):
 
 def replaced_data(model):
     for weight in model.gaussian_head.parameters():
-        weight.inner = 1.5 * weight.inner  # what ``weight.data = ...`` is on the pretend device
+        weight.inner = 1.5 * weight.inner  # the equivalent of ``weight.data = ...`` on the pretend device
 
 
 def replaced_stage(model):
@@ -153,7 +153,7 @@ def replaced_attribute(model):
     "change", [replaced_storage, replaced_data, replaced_stage, replaced_options, replaced_attribute]
 )
 def test_a_changed_model_is_not_replayed(change):
-    """Whatever is replaced, also within a stage, gives what an eager call gives."""
+    """After any replacement, also within a stage, the result equals that of an eager call."""
     predictor, batch = capturing("model=paper"), scene()
     for _ in range(3):
         before = predictor(batch)
@@ -162,11 +162,11 @@ def test_a_changed_model_is_not_replayed(change):
         found = predictor(batch)
         assert differs(found, eager(predictor, batch)) < 1e-6
         assert differs(found, before) > 1e-5
-    assert counts(predictor)["captured"] > 2  # those of the model before
+    assert counts(predictor)["captured"] > 2  # including those of the previous model
 
 
 def test_hooks_and_replaced_methods_are_called_every_time():
-    """Of any module, also within a stage; without them predictions are replayed again."""
+    """Of any module, also within a stage; after their removal, predictions are replayed again."""
     predictor, batch, calls = capturing("model=paper"), scene(), []
     head = predictor.model.gaussian_head
     activate = head.activate
@@ -195,7 +195,7 @@ def test_hooks_and_replaced_methods_are_called_every_time():
 
 @pytest.mark.parametrize(("kind", "size"), [("model=paper", 24), ("model=recurrent", 22)])
 def test_padded_views_are_captured(kind, size):
-    """Of sides that are no multiples of the patch size, as eagerly."""
+    """Sides that are not multiples of the patch size give the result of an eager call."""
     predictor = capturing(kind, "model.pad=multiple")
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (0, 0.7)):
         batch = scene(size=size, holes=holes, color=color)
@@ -216,7 +216,7 @@ def test_a_copy_captures_anew():
 
 
 def test_a_replay_launches_few_kernels(there):
-    """The encoder, the plan and what surrounds the stages remain, and as many waits as before."""
+    """Only launches for inputs and the plan remain, and synchronisations do not increase."""
     model, batch, counted = capturing("model=recurrent"), scene(), []
     model.graphs.backend = SilentBackend()
     for _ in range(3):
@@ -230,14 +230,13 @@ def test_a_replay_launches_few_kernels(there):
 
 
 def test_what_precedes_the_plan_keeps_names_and_gradients():
-    """Batches that differ in names alone are one class;
-    photographs that are learned get their gradient."""
+    """Batches that differ only in names share a bucket; images that require gradients get them."""
     model = capturing("model=paper")
     for name in ("a", "b", "c"):
         batch = dataclasses.replace(scene(), subjects=(name,), views=(("0", "1"),))
         inside, *_ = model.prepare(batch)
         assert (inside.subjects, inside.views) == ((name,), (("0", "1"),))
-        assert inside.targets is batch.targets  # whose skew the plan has read
+        assert inside.targets is batch.targets  # whose skew flag the plan has cached
         assert not vars(batch.targets.cameras)["has_skew"]
     assert counts(model) == {"eager": 1, "captured": 1, "replayed": 1}
     with torch.enable_grad():
@@ -248,6 +247,6 @@ def test_what_precedes_the_plan_keeps_names_and_gradients():
 
 
 def test_stages_alone_predict_a_capture():
-    """They get a predictor of their own; a size must be given, as they are no checkpoint."""
+    """A model without a predictor gets one of its own; a size must be given, since there is no checkpoint."""
     with pytest.raises(InputError, match="size: expected a size in pixels beside a model"):
         ghgs_capture.predict(None, make_model("model=paper"))

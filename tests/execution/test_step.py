@@ -39,7 +39,7 @@ def there():
 
 
 def training(*overrides):
-    """A model in training, with two rounds if it has some."""
+    """A model in training mode, with two rounds if it has any."""
     two = ("rounds.training_counts=[2]",) * ("model=recurrent" in overrides)
     return make_model(*overrides, *two).to(DEVICE).train()
 
@@ -52,7 +52,7 @@ def capturing(model, losses=LOSSES, backend=OperatorBackend, capture="auto"):
 
 
 def with_backend(captured, backend):
-    """A captured step with a stand-in for CUDA graphs."""
+    """Set a stand-in for CUDA graphs."""
     captured.predictor.graphs = GraphCache(limit=16, backend=backend())
     captured.graphs = GraphCache(limit=32, recent=8, backend=backend())
     return captured
@@ -76,7 +76,7 @@ def slopes(model, total):
 
 
 def called(model, batch, losses=LOSSES):
-    """The loss and its terms, operator by operator."""
+    """The loss and its terms, computed eagerly."""
     prediction = Predictor(model)(batch)
     rendering = Renderer()(prediction.gaussians, batch.targets.cameras)
     return *losses(prediction, rendering, batch), len(prediction.gaussians)
@@ -92,8 +92,7 @@ def called(model, batch, losses=LOSSES):
     ],
 )
 def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, losses, side):
-    """Of other batches of a shape bucket, also where a loss is divided among parts of a step, and of
-    padded views."""
+    """For other batches of a shape bucket, also with gradient accumulation and padded views."""
     model = training(*kind)
     captured = capturing(model, losses)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8)):
@@ -114,7 +113,7 @@ def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, los
 
 
 def test_a_factor_of_the_loss_changes_no_gradient():
-    """The same one or another, with the gradients of a step that is called."""
+    """For a constant or changing factor, gradients equal those of an eager step."""
     model, batch = training("model=paper"), scene()
     captured = capturing(model)
     wanted = slopes(model, called(model, batch)[0])
@@ -129,7 +128,7 @@ def test_a_factor_of_the_loss_changes_no_gradient():
 
 
 def test_gradients_of_float16_do_not_underflow():
-    """2^-26 is 0 in float16, and its multiple is not."""
+    """2^-26 is 0 in float16, but its multiple is not."""
     weight = torch.ones(4, requires_grad=True)
     total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
     assert step._differentiated(total, [weight], None)[0].abs().max() == 0
@@ -139,7 +138,7 @@ def test_gradients_of_float16_do_not_underflow():
 
 
 def test_weights_that_move_are_read_where_they_are():
-    """An optimizer moves them in place; the next replay reads them."""
+    """An optimizer updates weights in place; the next replay reads them."""
     model, batch = training("model=paper"), scene()
     captured = capturing(model)
     optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
@@ -155,7 +154,7 @@ def test_weights_that_move_are_read_where_they_are():
 
 
 def trained(folder, capture):
-    """Weights after four steps of two batches each, and how often passes were replayed."""
+    """Weights after four steps of two batches each, and the number of replays."""
     model = training("model=hull")
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, warmup=0.0))
     captured = with_backend(module.captured_step, OperatorBackend)
@@ -172,7 +171,7 @@ def trained(folder, capture):
 
 
 def test_a_training_comes_to_the_same_weights(tmp_path):
-    """With Lightning's loop, parts of a step that are summed up, and clipping."""
+    """With Lightning's loop, gradient accumulation and clipping."""
     (wanted, none), (found, replayed) = (trained(tmp_path, capture) for capture in ("off", "auto"))
     assert (none, replayed) == (0, 6)
     for name in wanted:
@@ -180,7 +179,8 @@ def test_a_training_comes_to_the_same_weights(tmp_path):
 
 
 class LaunchCounter(L.Callback):
-    """Launches and synchronisations of each step of a training, with optimizer, average and logging."""
+    """Counts launches and synchronisations of each training step, with optimizer, weight average and
+    logging."""
 
     def __init__(self, log):
         self.launch_log, self.counts = log, []
@@ -193,7 +193,8 @@ class LaunchCounter(L.Callback):
 
 
 def test_a_step_of_a_training_launches_few_kernels(there, tmp_path, monkeypatch):
-    """In Lightning's loop: synchronisations for the plan, for the room of renderings, and for the guard."""
+    """In Lightning's loop, with synchronisations only for the plan, the capacity of renderings, and the
+    guard."""
     model, counter = training("model=hull"), LaunchCounter(there)
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, matrix_scale=1.0))
     with_backend(module.captured_step, SilentBackend)
@@ -238,7 +239,7 @@ def test_too_little_room_is_followed_by_another_capture(monkeypatch):
 
 
 def test_a_batch_that_does_not_fit_is_called_and_prepared_once(monkeypatch):
-    """Such as one with subjects so tall that smaller copies are predicted, too."""
+    """For instance one with subjects so tall that downsampled copies are used."""
     model, batch = training("model=paper"), scene()
     wanted = float(called(model, batch)[0].detach().cpu())
     captured, calls = capturing(model), []
@@ -253,8 +254,8 @@ def test_a_batch_that_does_not_fit_is_called_and_prepared_once(monkeypatch):
 
 
 def test_sizes_are_kept_while_they_are_enough():
-    """Smaller subjects are replayed; a larger one leaves room for others;
-    nothing else changes."""
+    """Smaller subjects are replayed, a larger one increases the sizes with a margin, and results do not
+    change."""
     model = training("model=hull", "skip=fast")
     captured = capturing(model)
     for share in (0.1, 0.1, 0.07, 0.16, 0.17, 0.05):
@@ -272,8 +273,8 @@ def test_sizes_are_kept_while_they_are_enough():
 
 
 def test_what_cannot_be_captured_is_called(monkeypatch):
-    """Other devices, renderers and losses, float16 without a factor of the loss, predictions,
-    ``model.capture=off``."""
+    """Other devices, renderers and losses, float16 without a loss scale, predictions, and
+    ``model.capture=off`` run eagerly."""
     model, batch = training("model=paper"), scene()
     captured = capturing(model)
     assert captured.captures(batch)
@@ -294,7 +295,7 @@ def test_what_cannot_be_captured_is_called(monkeypatch):
 
 
 def test_hooks_see_every_step():
-    """A step of a model that is observed is called eagerly."""
+    """A step of a model with hooks runs eagerly."""
     model, batch, calls = training("model=paper"), scene(), []
     captured = capturing(model)
     model.encoder.register_forward_hook(lambda *_: calls.append(1))
@@ -306,7 +307,7 @@ def test_hooks_see_every_step():
 
 
 def test_shape_buckets_are_part_of_a_checkpoint(tmp_path):
-    """A run that goes on from one has the sizes of the run that wrote it."""
+    """A resumed run has the sizes of the run that wrote the checkpoint."""
     module = GHGSModule(training("model=hull", "skip=fast"), Renderer(), LOSSES, Optimization(lr=1e-2))
     captured = with_backend(module.captured_step, OperatorBackend)
     for share in (0.16, 0.05):
@@ -322,7 +323,7 @@ def test_shape_buckets_are_part_of_a_checkpoint(tmp_path):
 
 
 def test_times_of_a_step_do_not_keep_it_from_being_captured():
-    """The callback that every training has watches stages only where they are called."""
+    """The timing callback of every training wraps stages only in eager steps."""
     model = training("model=paper")
     for capture, is_free in (("auto", True), ("off", False)):
         captured = capturing(model, capture=capture)

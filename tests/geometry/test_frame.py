@@ -68,7 +68,7 @@ def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away
     torch.testing.assert_close(found.gaussians.scales / scale, expected.gaussians.scales, rtol=1e-3, atol=0)
     one, other = (quaternion_to_matrix(p.gaussians.quaternions) for p in (found, expected))
     assert (turn.mT.float() @ one - other).abs().max() < 1e-3
-    # At 100 km two splats at nearly one depth may change their order: 2.2e-5 in 4800 worlds.
+    # At 100 km, two splats at almost the same depth may swap their order: 2.2e-5 in 4800 worlds.
     assert (shown.image - image.image).abs().mean() < 1e-5 + 2e-10 * away
     assert (shown.depth / scale - image.depth).abs().mean() < 1e-4
 

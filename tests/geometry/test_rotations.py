@@ -93,7 +93,7 @@ def test_what_cameras_share_is_what_photographs_show():
     axes = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     motions = torch.zeros(4, 6)
     motions[:, 3] = torch.tensor([0.1, 0.0, -0.1, 0.0])
-    # As motions of points: front and back camera see them go apart, and no mean of them is a rig's.
+    # The two motions are opposite and have no common part.
     torch.testing.assert_close(without_common(motions, axes), motions)
     along = motions.clone()
     along[1, 3] = 1.0

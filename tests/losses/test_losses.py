@@ -82,7 +82,7 @@ def _reference_chamfer(a: torch.Tensor, b: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("away", [0.0, 500.0])
 def test_products_find_the_nearest_as_a_tree_does(monkeypatch, away):
-    """Also where blocks are small, far from the origin, and for one reference or no query."""
+    """Also with small blocks, far from the origin, with one reference, and without queries."""
     monkeypatch.setattr(geometry_chamfer, "_DISTANCES", 7000)
     generator = torch.Generator().manual_seed(3)
     a, b = (torch.randn(n, 3, generator=generator) + away for n in (999, 2000))
@@ -95,7 +95,7 @@ def test_products_find_the_nearest_as_a_tree_does(monkeypatch, away):
 
 
 def test_chamfer_is_scipys():
-    """The Chamfer distance equals one computed with SciPy, in float32 for half-precision input."""
+    """The Chamfer distance equals SciPy's, and is float32 for half-precision input."""
     g = torch.Generator().manual_seed(1)
     a, b = torch.rand(120, 3, generator=g), torch.rand(90, 3, generator=g)
     assert chamfer(a, b).item() == pytest.approx(_reference_chamfer(a, b), rel=1e-6)
@@ -112,8 +112,8 @@ def test_chamfer_gradient_is_that_of_finite_differences():
 
 @pytest.mark.parametrize("count", [0, 1, 3, 200])
 def test_points_that_do_not_count_change_nothing(count):
-    """Neither the distance nor its gradient, whatever they are:
-    against a tree on those that count."""
+    """Invalid points affect neither the distance nor its gradient, compared with a k-d tree on the valid
+    ones."""
     points = torch.rand(260, 3, generator=torch.Generator().manual_seed(count))
     references = torch.rand(150, 3, generator=torch.Generator().manual_seed(7)) + 0.3
     counts = torch.zeros(260, dtype=torch.bool)
@@ -198,7 +198,7 @@ def test_silhouettes_are_compared_with_the_masks_of_targets():
 
 @pytest.mark.parametrize("part", [(0, 1, 0, 1), (30, 41, 39, 40), (5, 25, 12, 30), (0, 0, 0, 0)])
 def test_ssim_of_images_that_differ_in_a_part(part):
-    """Value and gradient are those of the whole map."""
+    """Value and gradient equal those of the whole map."""
     top, bottom, left, right = part
     g = torch.Generator().manual_seed(5)
     target = torch.rand(2, 1, 3, 41, 40, generator=g, dtype=torch.float64)
@@ -216,7 +216,7 @@ def test_ssim_of_images_that_differ_in_a_part(part):
 
 
 def test_terms_of_weight_zero_are_not_computed():
-    """A term with weight 0 needs no data."""
+    """A term of weight 0 needs no data."""
     prediction, rendering, batch = _example(body=False, depths=False)
     losses = losses_of({"render_l1": 1.0, "chamfer": 0.0, "depth": 0.0})
     total, values = losses(prediction, rendering, batch)
@@ -228,7 +228,7 @@ def test_terms_of_weight_zero_are_not_computed():
 
 @pytest.mark.parametrize("term", ["chamfer", "depth"])
 def test_a_term_that_the_data_cannot_feed_is_an_error(term):
-    """A term whose data is missing is an error that names its key."""
+    """A term without its data raises an error that names its key."""
     prediction, rendering, batch = _example(body=False, depths=False)
     with pytest.raises(InputError, match=rf"loss\.weights\.{term}"):
         losses_of({term: 1.0})(prediction, rendering, batch)
@@ -244,7 +244,7 @@ def test_losses_without_any_subject_pixel_are_zero():
 
 
 def test_pixels_that_show_a_part_of_the_subject_have_depths():
-    """With a matte the subject's pixels are all that show some of it."""
+    """With a matte, all pixels with a matte above 0 belong to the subject."""
     prediction, rendering, batch = _example()
     soft = dataclasses.replace(batch, alpha=torch.full_like(batch.depths, 0.2))
     value = losses_of({"depth": 1.0})(prediction, rendering, soft)[1]["depth"]
@@ -259,7 +259,7 @@ def test_subsampled_chamfer_is_unbiased():
     torch.manual_seed(0)
     few = losses_of({"chamfer": 1.0}, chamfer_points=25)
     values = torch.stack([few(prediction, rendering, batch)[1]["chamfer"] for _ in range(200)])
-    assert len(values.unique()) > 100  # each step draws others
+    assert len(values.unique()) > 100  # each step samples other points
     assert values.mean().item() == pytest.approx(full["chamfer"].item(), rel=0.1)
 
 
@@ -281,6 +281,6 @@ def test_subsampled_chamfer_is_unbiased():
     ],
 )
 def test_impossible_values_name_their_key(arguments, key):
-    """Impossible options are refused with their key."""
+    """Impossible options are rejected by key."""
     with pytest.raises(InputError, match=key):
         losses_of(**arguments)

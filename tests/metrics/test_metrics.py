@@ -47,7 +47,7 @@ def test_authors_evaluation_numbers():
 
 
 def test_psnr_and_ssim_are_scikit_images():
-    """PSNR and SSIM equal scikit-image, as a mean and as a map."""
+    """PSNR and SSIM equal scikit-image's, as a mean and as a map."""
     metrics = pytest.importorskip("skimage.metrics")
     image, target = _images()
     options = {
@@ -58,7 +58,7 @@ def test_psnr_and_ssim_are_scikit_images():
         a, b = image[i].double(), target[i].double()
         mean, full = metrics.structural_similarity(a.numpy(), b.numpy(), **options)
         assert ssim(a[None], b[None], "valid").item() == pytest.approx(mean, abs=1e-6)
-        # The map inside the border, which scikit-image pads in another way.
+        # The map inside the border, which scikit-image pads differently.
         own = ssim_map(a[None], b[None], "reflect")[0]
         assert np.abs(own.numpy() - full)[:, 5:-5, 5:-5].max() < 1e-6
         expected = metrics.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1.0)
@@ -81,7 +81,7 @@ def test_ssim_is_wide_under_autocast():
 
 
 def test_psnr_of_known_errors_by_region():
-    """PSNR counts exactly the pixels of its region."""
+    """PSNR averages exactly the pixels of its region."""
     target = torch.zeros(1, 3, 10, 12)
     mask = torch.zeros(1, 10, 12, dtype=torch.bool)
     mask[0, 2, 3] = mask[0, 5, 8] = True
@@ -108,7 +108,7 @@ def test_psnr_of_known_errors_by_region():
     ],
 )
 def test_the_crop_is_that_of_published_scripts(box, expected):
-    """Sides of 1000 x 500 of 1024 x 1024, centred on the box, moved inside the image."""
+    """Sides of 1000 x 500 of 1024 x 1024, centred on the box and shifted into the image."""
     mask = torch.zeros(2, 1024, 1024, dtype=torch.bool)
     mask[0, box[0] : box[1], box[2] : box[3]] = True
     crop, (top, bottom, left, right) = crop_of(mask), expected
@@ -118,7 +118,7 @@ def test_the_crop_is_that_of_published_scripts(box, expected):
 
 
 def test_files_are_measured_as_written(tmp_path):
-    """``metrics.protocol=files``: PSNR and SSIM inside a window of what PNG files hold."""
+    """``metrics.protocol=files`` measures PSNR and SSIM of the 8-bit values that PNG files hold."""
     image, target = (0.3 * i + 0.35 for i in _images(1, 64, 48))
     mask = torch.zeros(1, 64, 48, dtype=torch.bool)
     mask[:, 20:50, 20:31] = True
@@ -154,7 +154,7 @@ def test_equal_images_and_empty_regions_are_defined():
 
 @pytest.mark.parametrize("size", [(10, 10), (3, 40), (1, 1)])
 def test_ssim_of_images_below_the_window_is_padded_as_in_the_release(size):
-    """The authors' evaluation surrounds images of any size with black; only its protocol does."""
+    """Only the release protocol pads with black, which works for images of any size."""
     image, target = torch.rand(
         2, 2, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -176,7 +176,7 @@ def test_ssim_of_images_below_the_window_is_padded_as_in_the_release(size):
 
 
 def test_ssim_of_a_region_is_the_mean_of_its_windows():
-    """A region's SSIM uses the windows centred in it; too small images are an error."""
+    """A region's SSIM averages the windows centred in it; images that are too small are an error."""
     image, target = _images(1)
     region = torch.zeros(1, 30, 41, dtype=torch.bool)
     region[0, 12, 20] = True
@@ -187,8 +187,7 @@ def test_ssim_of_a_region_is_the_mean_of_its_windows():
 
 
 def test_flip_is_the_reference_implementation():
-    """FLIP equals maps by the authors' flip-evaluator 1.7 at its default viewing distance
-    (``flip.npz``)."""
+    """FLIP equals maps by the authors' flip-evaluator 1.7 at its default viewing distance (``flip.npz``)."""
     data = np.load(FIXTURES / "flip.npz")
     reference, test = (
         torch.from_numpy(data[k].astype(np.float32) / 255).permute(0, 3, 1, 2) for k in ("reference", "test")
@@ -197,7 +196,7 @@ def test_flip_is_the_reference_implementation():
 
 
 def test_means_are_over_images():
-    """Not over batches; they accumulate in float64 and store nothing in checkpoints."""
+    """Means are over images, not batches, accumulate in float64, and store nothing in checkpoints."""
     image, target = _images(4)
     mask = torch.rand(4, 30, 41, generator=torch.Generator().manual_seed(5)) > 0.9
     for values in (psnr(image, target, box_of(mask)), ssim(image, target, "zeros")):
@@ -210,7 +209,7 @@ def test_means_are_over_images():
 
 
 def test_two_protocols_are_measured_side_by_side():
-    """Each as alone; names of the second end in its own."""
+    """Each protocol gives the values that it gives alone; names of the second have its suffix."""
     images = torch.rand(2, 2, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 1.2
     mask = torch.zeros(2, 24, 24, dtype=torch.bool)
     mask[:, 4:20, 6:18] = True
@@ -228,7 +227,7 @@ def test_two_protocols_are_measured_side_by_side():
 
 
 def test_a_protocol_reports_its_metrics_by_name():
-    """Each protocol reports its own names, and clamps only if it says so."""
+    """Each protocol reports its own names, and clamps only if it is defined to."""
     image, target = _images(2)
     mask = torch.zeros(2, 30, 41, dtype=torch.bool)
     mask[:, 8:20, 10:30] = True
@@ -249,7 +248,7 @@ def test_a_protocol_reports_its_metrics_by_name():
 
 
 def test_lpips_is_left_out_with_its_reason_or_refused():
-    """Without torchvision LPIPS is left out with a reason, or refused where it is required."""
+    """Without torchvision, LPIPS is skipped with a reason, or an error if it is required."""
     try:
         import torchvision  # noqa: F401
     except ImportError:
@@ -264,7 +263,7 @@ def test_lpips_is_left_out_with_its_reason_or_refused():
 
 
 class RecordingNetwork:
-    """Replaces torchmetrics' LPIPS: records its options and inputs."""
+    """Replaces torchmetrics' LPIPS, and records its options and inputs."""
 
     def __init__(self, net_type):
         self.net, self.net_type, self.inputs = self, net_type, []
@@ -306,7 +305,7 @@ def test_lpips_sees_what_its_protocol_says():
 
 @pytest.mark.usefixtures("recorded")
 def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
-    """A failed download of the weights leaves LPIPS out, with a message of one line."""
+    """If the weights cannot be downloaded, LPIPS is skipped with a one-line message."""
     import torchmetrics.image.lpip
 
     def offline(**_):
@@ -321,7 +320,7 @@ def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
 
 
 def test_depth_error_is_in_millimetres_on_known_subject_pixels():
-    """Depth errors count only subject pixels with a known depth, in millimetres."""
+    """Depth errors average only subject pixels with a known depth, in millimetres."""
     depth = torch.full((1, 2, 3), 2.0)
     truth = torch.tensor([[[2.01, 2.03, 0.0], [2.0, 5.0, 2.0]]])
     region = torch.tensor([[[True, True, True], [False, False, True]]])

@@ -1,5 +1,5 @@
-"""Metrics of what eyes see: outlines and edges of depth, light beside the subject, sharpness inside
-it, errors at one brightness, where Gaussians end."""
+"""Perceptual metrics: outlines and depth edges, light outside the subject, sharpness inside it, errors at
+a common brightness, and surface error of Gaussians."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,7 @@ SIDE = 48
 
 
 def _people(n=4):
-    """Noise on blobs, renders of it, and depths with a step of 2, 5,
-    10 and 15 cm through the blobs."""
+    """Noise on blobs, renders of it, and depths with a step of 2, 5, 10 and 15 cm across the blobs."""
     rng = np.random.default_rng(3)
     masks = ndimage.gaussian_filter(rng.normal(size=(n, SIDE, SIDE)), (0, 5, 5)) > 0.02
     targets = rng.uniform(size=(n, 3, SIDE, SIDE)) * masks[:, None]
@@ -28,13 +27,13 @@ def _people(n=4):
 
 
 def _distance(pixels):
-    """Rows and columns from each pixel to the nearest of some."""
+    """Distance in rows and columns from each pixel to the nearest True pixel."""
     return ndimage.distance_transform_cdt(~pixels, "chessboard")
 
 
 @pytest.mark.parametrize("person", range(4))
 def test_what_eyes_see_is_what_scipy_computes(person):
-    """Bands by distance transforms, Laplacians by ndimage, brightness by scaling both images."""
+    """References: bands by distance transforms, Laplacians by ndimage, brightness by scaling both images."""
     image, target, mask, depth = (each[person] for each in _people())
     inputs = [torch.from_numpy(each)[None] for each in (image, target, mask)]
     found = METRICS.measure(*inputs, SEEN, torch.from_numpy(depth)[None])
@@ -75,8 +74,7 @@ def test_what_eyes_see_is_what_scipy_computes(person):
 
 
 def test_what_eyes_see_of_nobody_is_absent():
-    """No subject or no light: nan, which means leave out, as of all regions;
-    equal images have the cap."""
+    """Without subject or light the value is nan, as in all regions; equal images give the cap."""
     images, targets, masks, depths = (torch.from_numpy(each) for each in _people(2))
     nobody = METRICS.measure(images, targets, masks & False, SEEN, 0 * depths)
     assert all(values.isnan().all() for values in nobody.values())
@@ -86,8 +84,7 @@ def test_what_eyes_see_of_nobody_is_absent():
 
 
 def test_the_surface_error_sees_where_gaussians_end():
-    """A plane of points: Gaussians 10 mm above it, a transparent one far away,
-    a hole that nothing covers."""
+    """A plane of points with Gaussians 10 mm above it, a transparent one far away, and an uncovered hole."""
     grid = torch.stack(torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij"), -1).flatten(
         0, 1
     )

@@ -84,7 +84,7 @@ def test_views_agree_better(views, pixels, seed):
     torch.testing.assert_close(found.cameras.intrinsics, wrong.cameras.intrinsics, rtol=0.02, atol=0)
     rotation = found.cameras.extrinsics[0, :, :3, :3].double()
     identity = torch.eye(3).double().expand(views, 3, 3)
-    # Four turns in float32: each rounds nine entries, of which a product takes six.
+    # Four rotations in float32: each rounds nine entries, of which a product takes six.
     limit = 4 * 6 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(rotation @ rotation.mT, identity, rtol=0, atol=limit)
     assert max(pixels_moved(wrong, found)[0]) > 0.3
@@ -186,7 +186,7 @@ def test_any_unit_and_origin():
     wrong = off(truth)
     expected = pixels_moved(wrong, CameraRefinement(1, predictor(truth), RENDERER)(wrong))
     moved = far_away(wrong)
-    # The refinement predicts in the subject's own frame, in which lengths are the same.
+    # The refinement predicts in the subject's frame, in which lengths are the same.
     found = CameraRefinement(1, predictor(truth), RENDERER)(moved)
     assert found.cameras.extrinsics.dtype == torch.float64
     np.testing.assert_allclose(pixels_moved(moved, found), expected, atol=0.05)

@@ -15,7 +15,7 @@ from ghgs_lit.refinement.outlines import Outlines, best_points, gradients_of, ro
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import CENTER, ellipsoid, off, ring
 
-#: A body with two arms and a leg that stand out: middles beside the subject's, and radii.
+#: A body with two arms and a leg that stick out: centres relative to the subject's, and radii.
 PARTS = [
     ((0.0, 0.0, 0.0), (0.25, 0.8, 0.2)),
     ((0.4, 0.3, 0.05), (0.3, 0.07, 0.08)),
@@ -178,7 +178,7 @@ def test_gradients_are_those_of_finite_differences():
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
     gradients = gradients_of(outlines, lens, pose, points, other)
-    # a turn is about the frame's origin, not about the subject
+    # a rotation is about the frame's origin, not about the subject
     middle = torch.tensor([0.2, -0.1, 0.3])
     rows = rows_of(points, gradients, pose[other], middle)
 
@@ -263,7 +263,7 @@ def test_focal_lengths_that_contradict_one_another_come_nearer(monkeypatch):
     """All focal lengths are off: their observable part is recovered, and is not mistaken for a motion."""
     truth = figure()
     zoom = torch.tensor([1.0, 1.06, 1.0, 1.0])
-    zoom = zoom / zoom.log().mean().exp()  # what all share, they do not show
+    zoom = zoom / zoom.log().mean().exp()  # a common zoom is not observable
     wrong = with_zooms(truth, zoom)
     monkeypatch.setattr(coherence, "_minority", lambda *_: None)
     found, _, _ = coherent_cameras(wrong)

@@ -62,7 +62,7 @@ def test_a_view_that_nobody_saw_gets_better():
 def test_changes_are_bounded():
     """Parts that no image shows stay near the prediction, however long the refinement."""
     splats, inputs, _ = scene(size=42)
-    splats.opacities[:2] = torch.tensor((0.0, 1.0))  # which no step of their logit could leave
+    splats.opacities[:2] = torch.tensor((0.0, 1.0))  # a step of their infinite logits could not change these
     noise = dataclasses.replace(inputs, images=torch.rand(inputs.images.shape) * inputs.masks[:, :, None])
     refined = Refinement(70, RENDERER)(splats, noise)
     depth = world_to_camera(splats.means, inputs.cameras.extrinsics[0][splats.image])[:, 2]

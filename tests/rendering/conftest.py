@@ -1,4 +1,4 @@
-"""Tests of the renderer start with one thread."""
+"""Fixture: tests of the renderer start with one thread."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Options, errors and configs of the renderer."""
+"""Options, errors and configurations of the renderer."""
 
 import dataclasses
 
@@ -41,13 +41,13 @@ def test_impossible_options_are_refused_by_name(kind, options, key):
 
 @pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (float("nan"), 1.0), (1.0, float("inf"))])
 def test_an_impossible_range_of_depths_is_refused(near, far):
-    """Nothing would be drawn, or everything behind the camera."""
+    """Such a range would render nothing, or Gaussians behind the camera."""
     with pytest.raises(InputError, match=r"near|far"):
         render(cloud(5), camera_ring(1, 20, 30), "cpu", near=near, far=far)
 
 
 def test_auto_is_the_cpu_backend_for_cpu_tensors():
-    """``auto`` renders CPU tensors by the CPU backend."""
+    """``auto`` selects the CPU backend for CPU tensors."""
     gaussians, views = cloud(20), camera_ring(2, 20, 30)
     assert torch.equal(Renderer()(gaussians, views).image, render(gaussians, views, "cpu").image)
 
@@ -59,7 +59,7 @@ def one_camera(size):
 
 
 def unturned(means, scale, colors, **constants):
-    """Opaque balls."""
+    """Opaque spherical Gaussians."""
     count = len(means)
     turns, scales = torch.tensor([[1.0, 0, 0, 0]] * count), torch.full((count, 3), scale)
     return Gaussians(torch.tensor(means), turns, scales, torch.ones(count), colors, (count,), **constants)
@@ -67,8 +67,8 @@ def unturned(means, scale, colors, **constants):
 
 @pytest.mark.parametrize("verb", ["train", "evaluate"])
 def test_the_release_renders_with_its_own_constants(verb):
-    """A splat 0.1 m from the camera cost 4 dB:
-    the authors cull below 0.2 m and cap alpha at 0.99."""
+    """Regression: the authors cull below 0.2 m and cap alpha at 0.99; a splat 0.1 m from the camera cost
+    4 dB."""
     nodes = [
         OmegaConf.to_container(project_compose(verb, overrides).renderer)
         for overrides in ([], ["compat=release"], ["compat=release", "renderer.near=0.05"])
@@ -84,8 +84,7 @@ def test_the_release_renders_with_its_own_constants(verb):
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_backgrounds(backend):
-    """Every form of background is blended by one minus alpha;
-    a wrong number of channels is refused."""
+    """Every form of background is blended with weight 1 - alpha; a wrong number of channels is rejected."""
     gaussians, views = cloud(20), camera_ring(2, 20, 30)
     black = render(gaussians, views, backend)
     behind = 1 - black.alpha
@@ -106,7 +105,7 @@ def test_backgrounds(backend):
 
 
 def test_the_background_is_differentiable():
-    """A learned background gets its gradient."""
+    """A learned background gets a gradient."""
     background = torch.zeros(3, requires_grad=True)
     rendering = render(cloud(20), camera_ring(1, 20, 30), "cpu", background=background)
     rendering.image.sum().backward()
@@ -131,7 +130,7 @@ def test_inputs_that_do_not_fit_are_refused_by_name(gaussians, views, key):
 
 
 def test_gaussians_are_drawn_with_the_constants_that_they_were_made_for():
-    """Unless settings say otherwise."""
+    """Unless settings override them."""
     views = one_camera(10)
     one = unturned([[0, 0, 1.0]], 0.02, torch.ones(1, 3), low_pass=0.1, antialiased=True)
     sharp, plain = RasterSettings(low_pass=0.1, antialiased=True), RasterSettings()
@@ -143,7 +142,7 @@ def test_gaussians_are_drawn_with_the_constants_that_they_were_made_for():
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_elements_of_worlds_far_apart_are_drawn_as_near_the_origin(backend):
-    """In float64 each is moved to its own cameras: 1000 km away float32 knows 6 cm."""
+    """Float64 elements are moved to their cameras: 1000 km away, float32 resolves only 6 cm."""
     splats, views = cloud(20, splits=(12, 8)), camera_ring(2, 20, 30, batch=2)
     expected = render(splats, views, backend)
     away = torch.tensor([[0.0, 0.0, 0.0], [1e6, -4e5, 3e5]]).double()
@@ -159,8 +158,7 @@ def test_elements_of_worlds_far_apart_are_drawn_as_near_the_origin(backend):
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_the_worlds_unit_changes_no_image(backend):
-    """Gaussians that know how long a metre is: in millimetres the image is the same,
-    depth is 1000 times."""
+    """With ``metre`` set, a world in millimetres gives the same image, and 1000 times the depth."""
     splats, views = cloud(20, splits=(12, 8)), camera_ring(2, 20, 30, batch=2)
     expected = render(splats, views, backend, near=2.5, far=3.2)
     units = torch.tensor([1.0, 1000.0])
@@ -179,8 +177,7 @@ def test_the_worlds_unit_changes_no_image(backend):
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize(("near", "far", "drawn"), [(0.5, 2.0, 0), (1.5, 4.0, 1), (1.0, 3.0, 2)])
 def test_near_and_far_are_depths_of_centres(backend, near, far, drawn):
-    """Of two splats beside each other, 1 m and 3 m away: those within the range,
-    its ends included."""
+    """Of two splats 1 m and 3 m away, those within the range, its ends included, are rendered."""
     two = unturned([[-0.2, 0, 1.0], [0.6, 0, 3.0]], 0.05, torch.eye(3)[:2])
     found = render(two, one_camera(20), backend, near=near, far=far).image[0, 0].flatten(1).sum(1)
     assert (found[:2] > 0.5).tolist() == [drawn in (0, 2), drawn in (1, 2)]

@@ -1,5 +1,5 @@
-"""The CPU backend against the reference in float64: images, alphas, depths and every gradient, also of huge,
-tiny, zero and broken values, and at thresholds."""
+"""The CPU backend against the reference in float64: images, alphas, depths and all gradients, also for
+huge, tiny, zero and broken values, and at thresholds."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ def of_scale(scale):
 
 
 def equal_depths():
-    """Thousands of splats that are drawn in the order of their index."""
+    """Thousands of splats of equal depth, which are rendered in the order of their index."""
     gaussians = few(means=torch.zeros(3000, 3), scales=[[0.05, 0.07, 0.03]], opacities=[0.01])
     return dataclasses.replace(
         gaussians, colors=torch.rand(3000, 3, generator=torch.Generator().manual_seed(3))
@@ -64,7 +64,7 @@ SCENES = {
         for height, width in [(45, 70), (16, 32), (1, 1), (3, 33)]
         for antialiased in (False, True)
     },
-    # more or fewer channels than a splat's record holds
+    # more or fewer channels than a splat's record can hold
     **{f"{n} channels": (cloud(60, channels=n, size=0.2), (1, 20, 20), {}) for n in (1, 2, 8, 9, 20)},
     "other constants": (cloud(80, size=0.3), (1, 24, 24), {"settings": OTHER}),
     "one splat in all tiles": (few(scales=[[3.0, 2.0, 4.0]]), (1, 50, 90), {}),
@@ -99,7 +99,7 @@ def test_images_and_gradients_are_the_references(name):
     ],
 )
 def test_what_shows_nothing_has_no_gradient(gaussians):
-    """Opacities of zero, below zero and NaN; behind the camera, or nearer than ``near``."""
+    """Opacities of zero, below zero and NaN; Gaussians behind the camera or nearer than ``near``."""
     gaussians = with_gradients(gaussians)
     rendering = render(gaussians, camera_ring(1, 20, 20), "cpu", background=0.5, near=0.015)
     rendering.image.sum().backward()
@@ -118,7 +118,7 @@ def test_a_clamped_alpha_has_no_gradient_in_opacity():
 
 
 def test_elements_with_different_numbers_of_gaussians():
-    """An element's image does not depend on the other elements, and an empty one is background."""
+    """An element's image does not depend on other elements, and an empty one shows the background."""
     gaussians = cloud(100, splits=(0, 70, 1, 29))
     rendering = assert_cpu_matches_reference(gaussians, camera_ring(3, 20, 36, batch=4), background=0.5)
     assert (rendering.alpha[0] == 0).all()
@@ -149,7 +149,7 @@ def test_scenes_of_any_kind(seed, count, size, distance, height, width):
 
 @pytest.mark.parametrize(("splits", "views"), [((0, 0), 0), ((0, 0), 2), ((5,), 0), ((), 2)])
 def test_without_gaussians_views_or_elements(splits, views):
-    """The image is background, or empty, and gradients are 0."""
+    """The image is the background, or empty, and gradients are 0."""
     gaussians = with_gradients(cloud(sum(splits), splits=splits))
     cameras = camera_ring(2, 20, 30, batch=2)[: len(splits), :views]
     rendering = render(gaussians, cameras, "cpu", background=0.25)
@@ -168,8 +168,7 @@ def test_of_equal_depths_the_first_index_is_in_front():
 
 
 def test_inputs_of_any_layout_and_dtype():
-    """Strided, float64 and bfloat16 inputs are converted,
-    and gradients come back in their dtype."""
+    """Strided, float64 and bfloat16 inputs are converted, and gradients have their dtype."""
     plain, views = cloud(40), camera_ring(1, 24, 24)
     wanted = render(plain, views, "cpu").image
     strided = dataclasses.replace(
@@ -210,7 +209,7 @@ def test_neither_signs_of_scales_nor_norms_of_quaternions_matter(factors):
 
 
 def test_the_zero_quaternion_is_identity_without_gradient():
-    """A zero quaternion is drawn unrotated and gets no gradient, not NaN."""
+    """A zero quaternion is rendered unrotated and gets a gradient of 0, not NaN."""
     views = camera_ring(1, 20, 20)
     zero = with_gradients(few(quaternions=[[0.0] * 4], scales=[[0.1, 0.2, 0.05]]))
     rendering = render(zero, views, "cpu")
@@ -248,7 +247,7 @@ def test_far_off_screen(far_off):
 @pytest.mark.parametrize("field", ["means", "quaternions", "scales", "opacities"])
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_what_is_not_a_number_reaches_no_other_gaussian(field, value):
-    """A Gaussian with NaN or infinity in its geometry disturbs no other one."""
+    """A Gaussian with NaN or infinity in its geometry affects no other."""
     healthy, views = cloud(30, size=0.2), camera_ring(1, 24, 24)
     broken = dataclasses.replace(healthy, **{field: getattr(healthy, field).clone()})
     getattr(broken, field).view(30, -1)[7, 0] = value
@@ -266,7 +265,7 @@ def test_what_is_not_a_number_reaches_no_other_gaussian(field, value):
 @pytest.mark.parametrize("value", [NAN, INF])
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_a_colour_that_is_not_finite_stays_in_its_pixels(backend, value):
-    """A broken colour reaches only the pixels that see it, and no gradient of others."""
+    """A broken colour affects only the pixels of its splat, and no gradients of others."""
     views = camera_ring(1, 40, 40)
     scene = few(means=[[-0.3, 0, 0], [0.45, 0.3, 0]], scales=[[0.03] * 3])
     scene.colors[1] = value
@@ -304,7 +303,7 @@ def test_thresholds_at_equality():
 
 
 def test_antialiased_splats_without_area_vanish():
-    """With anti-aliasing a splat without area is invisible and gives no NaN."""
+    """With antialiasing, a splat without area is invisible and gives no NaN."""
     gaussians = with_gradients(
         few(scales=[[0.0] * 3, [0.2, 0.0, 0.0], [0.1] * 3], means=[[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]])
     )
@@ -317,8 +316,8 @@ def test_antialiased_splats_without_area_vanish():
 
 
 def test_more_splats_in_tiles_than_memory_are_refused_at_once():
-    """60 000 splats that fill the frame take 5 GB with their gradients;
-    one line, before any is allocated."""
+    """60 000 splats that fill the frame take 5 GB with their gradients; a one-line error comes before any
+    allocation."""
     gaussians = cloud(60_000)
     full = dataclasses.replace(gaussians, scales=torch.full_like(gaussians.scales, 1e4))
     full.means.requires_grad_()

@@ -1,5 +1,5 @@
-"""gsplat: its projection in PyTorch as an independent check, how it is called,
-and its image on a GPU."""
+"""gsplat: its PyTorch projection as an independent check, the arguments of its calls, and its image on a
+GPU."""
 
 import contextlib
 import dataclasses
@@ -28,7 +28,7 @@ from tests.helpers.splats import (
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("distance", [3.0, 0.8])
 def test_projection_is_that_of_gsplat(distance, antialiased):
-    """Centres, inverse covariances, depths, opacities and their gradients equal gsplat's
+    """Centres, inverse covariances, depths, opacities and their gradients equal those of gsplat's
     projection."""
     gaussians, views = with_gradients(cloud(200), torch.float64), camera_ring(3, 40, 50, distance=distance)
     views = Cameras(views.intrinsics.double(), views.extrinsics.double(), 40, 50)
@@ -71,14 +71,14 @@ def test_projection_is_that_of_gsplat(distance, antialiased):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="tests the error without CUDA")
 def test_gsplat_without_cuda_says_what_is_missing():
-    """Without CUDA the error names the backend and the reason."""
+    """Without CUDA, the error names the backend and the reason."""
     with pytest.raises(BackendUnavailable, match=r"renderer\.backend=gsplat.*CUDA"):
         render(cloud(5), camera_ring(1, 8, 8), "gsplat")
 
 
 @pytest.mark.parametrize("broken", [None, types.ModuleType("gsplat")])
 def test_a_broken_gsplat_says_why_it_cannot_be_loaded(monkeypatch, broken):
-    """One that was built for another PyTorch, or half removed, before anything is drawn."""
+    """A gsplat built for another PyTorch, or half removed, raises before anything is rendered."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", broken)
     with pytest.raises(BackendUnavailable, match=r"`import gsplat` failed with (ModuleNotFound|Attribute)"):
@@ -93,7 +93,7 @@ def test_gsplat_refuses_constants_it_does_not_know():
 
 @pytest.fixture(autouse=True)
 def forgotten():
-    """What earlier renderings needed, and what was said of other versions."""
+    """Resets the capacities that earlier renderings needed, and the warnings about versions."""
     capacity._expected.clear()
     gsplat_backend._is_known.cache_clear()
 
@@ -101,8 +101,8 @@ def forgotten():
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("gsplat", [Documented, InParts])
 def test_gsplat_is_called_as_documented(monkeypatch, gsplat, antialiased):
-    """gsplat gets finite, normalised input, and its output is read as documented;
-    once for a batch."""
+    """gsplat gets finite, normalised inputs, is called once per batch, and its output is read as
+    documented."""
     monkeypatch.setattr(gsplat_backend, "load", lambda: gsplat)
     gaussians, views = cloud(40, splits=(15, 0, 25)), camera_ring(2, 20, 30, batch=3)
     gaussians.quaternions[3] = 0
@@ -122,7 +122,7 @@ def test_gsplat_is_called_as_documented(monkeypatch, gsplat, antialiased):
 
 
 def test_an_unknown_version_is_said_once(monkeypatch):
-    """Kernels of other versions may read the lists of tiles otherwise."""
+    """Kernels of other versions may read the lists of tiles differently."""
     monkeypatch.setattr(gsplat_backend, "load", lambda: Documented)
     gaussians, views = cloud(20, splits=(10, 10)), camera_ring(1, 8, 8, batch=2)
     with pytest.warns(UserWarning, match="the host waits"):
@@ -133,7 +133,7 @@ def test_an_unknown_version_is_said_once(monkeypatch):
 
 
 def test_the_gradient_in_parts_is_that_of_the_reference(monkeypatch):
-    """Through projection, the lists of tiles and drawing, for all that a Gaussian has."""
+    """Gradients flow through projection, lists of tiles and rasterization to all attributes."""
     monkeypatch.setattr(gsplat_backend, "load", lambda: InParts)
     gaussians, views = cloud(80, splits=(45, 35)), camera_ring(2, 40, 50, batch=2)
     weights = torch.randn(2, 2, 3, 40, 50, generator=torch.Generator().manual_seed(1))
@@ -149,7 +149,7 @@ def test_the_gradient_in_parts_is_that_of_the_reference(monkeypatch):
 
 
 def test_every_argument_is_one_of_gsplat():
-    """The arguments and defaults that are relied on exist in the installed gsplat."""
+    """The arguments and defaults in use exist in the installed gsplat."""
     gsplat = pytest.importorskip("gsplat", reason="needs the package gsplat (it needs no GPU for this test)")
     for name in ("fully_fused_projection", "rasterize_to_pixels"):
         called = list(inspect.signature(getattr(InParts, name)).parameters)
@@ -164,14 +164,14 @@ def test_every_argument_is_one_of_gsplat():
 
 
 def at_thresholds():
-    """Opacities just below and above 1/255; ten opaque splats behind one another, which saturate before the
-    last; one nearer than ``near``; one behind the camera."""
+    """Opacities just below and above 1/255; ten opaque splats behind one another, which saturate before
+    the last; one nearer than ``near``; one behind the camera."""
     z = [0.0, 0.0, *(0.2 + 0.05 * i for i in range(10)), -2.995, -4.0]
     x = [-0.4, 0.4, *(0.02 * i for i in range(10)), 0.0, 0.0]
     means = torch.tensor([x, [0.01] * len(x), z]).T
     opacities = [0.9 / 255, 1.2 / 255, *[0.9, 1.0] * 5, 1.0, 1.0]
     colors = torch.rand(len(x), 3, generator=torch.Generator().manual_seed(0))
-    # Three lengths: the rotation of a ball has no gradient.
+    # Three different scales: the rotation of a sphere has no gradient.
     gaussians = few(means=means, opacities=opacities, colors=colors, scales=[[0.06, 0.1, 0.14]])
     return dataclasses.replace(gaussians, splits=(0, len(x), 0))
 

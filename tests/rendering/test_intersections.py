@@ -1,5 +1,5 @@
-"""Splats of tiles against gsplat's functions in plain PyTorch,
-and room for them that never is too small."""
+"""Splats of tiles against gsplat's PyTorch functions, and buffers whose capacity always suffices in the
+end."""
 
 import pytest
 import torch
@@ -21,13 +21,13 @@ def forgotten():
 
 
 def splats(images, count, height, width, seed=0):
-    """Boxes that lie across tiles, beyond the image and nowhere; a fifth has one depth."""
+    """Boxes that overlap tiles, lie outside the image or are empty; a fifth of them has one depth."""
     generator = torch.Generator().manual_seed(seed)
     centers = torch.rand(images, count, 2, generator=generator) * torch.tensor([1.3 * width, 1.3 * height])
     radii = (torch.rand(images, count, 2, generator=generator) * 24 - 2).clamp(min=0).ceil().int()
     depths = 1 + torch.rand(images, count, generator=generator)
     depths[:, ::5] = 1.5
-    # gsplat leaves values of splats that it does not draw as they were
+    # gsplat leaves values of culled splats uninitialised
     centers[:, ::7] = float("nan")
     radii[:, ::7] = 0
     return centers - 10, radii, depths
@@ -35,13 +35,14 @@ def splats(images, count, height, width, seed=0):
 
 @pytest.mark.parametrize("size", [(3, 200, 60, 75), (1, 9, 16, 16), (2, 90, 100, 33), (40, 3, 400, 400)])
 def test_splats_and_offsets_are_those_of_gsplat(size):
-    """In its order: by image, tile, depth, index; 40 images have more tiles than 16 bits count."""
+    """The order is gsplat's: by image, tile, depth, index; 40 images have more tiles than 16 bits can
+    count."""
     images, _, height, width = size
     rows, columns = -(-height // TILE), -(-width // TILE)
     centers, radii, depths = splats(*size)
     drawn = centers.nan_to_num()
     _, keys, wanted = functions()._isect_tiles(drawn, radii, depths, TILE, columns, rows, sort=False)
-    keys, order = keys.sort(stable=True)  # as a radix sort is
+    keys, order = keys.sort(stable=True)  # like a radix sort
     offsets = functions()._isect_offset_encode(keys, images, columns, rows)
     found = intersections(centers, radii, depths, height, width, len(keys) + 37)
     assert int(found.needed) == len(keys) > 0
@@ -60,7 +61,7 @@ def test_splats_and_offsets_are_those_of_gsplat(size):
 @pytest.mark.parametrize("size", [(3, 200, 60, 75), (1, 1, 16, 16), (2, 90, 100, 33), (40, 3, 400, 400)])
 @pytest.mark.parametrize("capacity", [1, 300, 5000])
 def test_lists_of_kernels_are_equal(size, capacity):
-    """With room for some intersections, for all, and for more."""
+    """With capacity for some intersections, for all, and for more."""
     values = splats(*size)
     wanted = intersections(*values, *size[2:], capacity)
     with kernels() as called:
@@ -72,7 +73,7 @@ def test_lists_of_kernels_are_equal(size, capacity):
 
 
 def test_nothing_is_asked_of_the_device():
-    """The second time, when what depends on sizes alone is there."""
+    """A second call, with cached constants, causes no device-to-host synchronisation."""
     values = splats(2, 50, 40, 40)
     with pretend_device() as log:
         values = [value.to(DEVICE) for value in values]
@@ -103,7 +104,8 @@ def drawn(size=0.3):
 
 
 def test_an_image_is_drawn_again_where_splats_lacked_room(capacities):
-    """The image is the reference's; the next one has room at once, and the room shrinks slowly."""
+    """The image equals the reference's; the next one has enough capacity at once, and capacities shrink
+    slowly."""
     found, wanted = drawn()
     torch.testing.assert_close(found.image, wanted.image, rtol=1e-3, atol=1e-4)
     assert len(capacities) == 2
@@ -117,7 +119,7 @@ def test_an_image_is_drawn_again_where_splats_lacked_room(capacities):
 
 
 def test_several_renderings_are_settled_together(capacities):
-    """One answer for all; only what lacked room is repeated, with the call that it belongs to."""
+    """One synchronisation for all renderings; only calls that lacked capacity are repeated."""
     calls = []
 
     def call():
@@ -132,7 +134,7 @@ def test_several_renderings_are_settled_together(capacities):
 
 
 def test_too_little_room_is_seen_also_when_played_back(capacities):
-    """What the same renderings need with other values takes the place of the numbers."""
+    """On replay with other values, the needed numbers are updated in place."""
     with deferred() as rooms:
         drawn(size=0.01)
     assert rooms.suffice()

@@ -1,4 +1,4 @@
-"""The CPU backend with several threads and processes, other processors, and cached machine code."""
+"""The CPU backend with several threads and processes, on other processors, and with cached machine code."""
 
 import dataclasses
 import multiprocessing
@@ -35,7 +35,7 @@ def test_the_same_bits_with_any_number_of_threads(monkeypatch, splits):
 
 
 def test_two_threads_of_the_caller_at_once():
-    """Two threads that render at once do not disturb each other."""
+    """Two threads that render concurrently do not disturb each other."""
     torch.set_num_threads(2)
     gaussians, views = body(2000, 48), camera_ring(2, 48, 48)
     wanted = render(gaussians, views, "cpu").image
@@ -107,7 +107,7 @@ def train_in_workers():
 
 
 def sums() -> tuple[float, float]:
-    """Of an image, and of a gradient's squares."""
+    """Sum of an image, and of the squares of a gradient."""
     gaussians = with_gradients(body(300, 24))
     image = render(gaussians, camera_ring(1, 24, 24), "cpu").image
     image.square().sum().backward()
@@ -116,8 +116,7 @@ def sums() -> tuple[float, float]:
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="takes x86 vectors away")
 def test_the_same_image_without_wide_vectors():
-    """A processor with 128-bit vectors only gives the same image (the first run compiles
-    for a while)."""
+    """A processor with only 128-bit vectors gives the same image (the first run compiles for a while)."""
     code = "from tests.rendering.test_processes import sums; print(*sums())"
     done = run_python(code, NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
     assert [float(number) for number in done.stdout.split()] == pytest.approx(sums(), rel=1e-5)

@@ -14,7 +14,7 @@ from tests.helpers.splats import FIELDS, camera_ring, cloud
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_of_the_reference_are_those_of_its_values(antialiased):
-    """The reference's gradients are those of its values, where no threshold makes steps."""
+    """Gradients match finite differences where no threshold causes steps."""
     settings = RasterSettings(alpha_min=1e-12, stop=0.0, extent=30.0, antialiased=antialiased)
     gaussians = cloud(4, size=0.3, splits=(3, 1))
     views = camera_ring(1, 3, 4, batch=2).to(torch.float64)

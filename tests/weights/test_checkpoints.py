@@ -1,4 +1,4 @@
-"""Checkpoints rebuild their models; files that do not fit are refused by name."""
+"""Checkpoints rebuild their models; files that do not fit are rejected by name."""
 
 import os
 import pickle
@@ -28,7 +28,8 @@ from tests.helpers.training import held
 
 
 def test_a_checkpoint_rebuilds_its_model_without_any_yaml(tmp_path):
-    """The same Gaussians; weights are mapped, not copied, and training does not write to the file."""
+    """The model predicts the same Gaussians; weights are memory-mapped, and training does not write to
+    the file."""
     path, model = checkpoint(tmp_path / "a.ckpt"), make_model().eval()
     before, loaded = path.read_bytes(), load_model(path)
     assert not loaded.training
@@ -61,7 +62,7 @@ def a_safetensors(folder):
 
 
 def of_torch(content):
-    """The bytes of a file that ``torch.save`` writes."""
+    """Bytes of a file written by ``torch.save``."""
 
     def make(folder):
         torch.save(content, folder / "made.pt")
@@ -71,7 +72,7 @@ def of_torch(content):
 
 
 def changed(**changes):
-    """The bytes of a checkpoint with other entries."""
+    """Bytes of a checkpoint with other entries."""
     return lambda folder: checkpoint(folder / "changed.ckpt", **changes).read_bytes()
 
 
@@ -151,7 +152,7 @@ BAD_FILES = {
 
 @pytest.mark.parametrize("name", BAD_FILES)
 def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
-    """Failed downloads and pickled code must be explained, and never be executed."""
+    """Failed downloads and pickled code raise a one-line error, and code is never executed."""
     make, message = BAD_FILES[name]
     path = tmp_path / "bad.ckpt"
     path.write_bytes(make(tmp_path))
@@ -167,7 +168,7 @@ def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
 
 
 def test_a_path_without_a_file_is_refused(tmp_path):
-    """A wrong path must be named in one line."""
+    """A wrong path is named in one line."""
     with pytest.raises(FileNotFoundError, match=r"c\.ckpt: expected a file of weights; found none"):
         load_model(tmp_path / "c.ckpt")
     with pytest.raises(InputError, match="found a directory"):
@@ -178,7 +179,7 @@ def test_a_path_without_a_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize("trainable", ["none", "last_1", "last_2", "all"])
 def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
-    """``encoder.trainable`` must decide which parameters get gradients and are in the optimizer."""
+    """``encoder.trainable`` determines which parameters get gradients and are in the optimizer."""
     path = tmp_path / "a.ckpt"
     checkpoint(path, config=config(f"encoder.trainable={trainable}"))
     model = load_model(path).train()
@@ -205,8 +206,8 @@ def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
-    """``${sqlite:...}`` in the data of a checkpoint made folders:
-    verbs merge it into their configuration."""
+    """Regression: ``${sqlite:...}`` in a checkpoint created folders, because commands merge it into their
+    configuration."""
     path, called = tmp_path / "a.ckpt", []
     OmegaConf.register_new_resolver("called", called.append, replace=True)
     for node in (
@@ -222,14 +223,14 @@ def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
 
 
 def loop():
-    """A mapping that holds itself."""
+    """A mapping that contains itself."""
     node = {"kind": "scans"}
     node["split"] = [node]
     return node
 
 
 def doubled(levels=40):
-    """A few hundred bytes that are a billion values when they are written out."""
+    """A few hundred bytes that expand to a billion values."""
     node = {"a": 1}
     for _ in range(levels):
         node = {"a": node, "b": node}
@@ -238,8 +239,8 @@ def doubled(levels=40):
 
 @pytest.mark.parametrize("many", [loop(), {"kind": "scans", "x": doubled(20)}, doubled(60)])
 def test_a_configuration_without_end_is_refused(tmp_path, many):
-    """PyTorch's files may hold references; recursion and memory ended in tracebacks,
-    or not at all."""
+    """Regression: references in PyTorch's files led to tracebacks about recursion or memory, or no end at
+    all."""
     path = tmp_path / "a.ckpt"
     checkpoint(path, config={**config(), "data": many})
     with pytest.raises(InputError, match=r"a\.ckpt: config\.data.*: expected less than 32 levels and 100000"):
@@ -255,8 +256,7 @@ def test_a_configuration_of_other_things_than_yaml_says_is_refused(tmp_path):
 
 
 def test_weights_in_double_precision_are_read_in_single(tmp_path):
-    """A converter, or a run with ``trainer.precision=64-true``, writes them;
-    the model computes in single."""
+    """Converters and runs with ``trainer.precision=64-true`` write float64; the model computes in float32."""
     made = content()
     double = {key: value.double() for key, value in made["state_dict"].items() if value.is_floating_point()}
     torch.save({**made, "state_dict": {**made["state_dict"], **double}}, tmp_path / "a.ckpt")
@@ -281,7 +281,7 @@ def test_a_state_of_training_of_another_form_is_refused(tmp_path, key, value):
 
 @pytest.mark.parametrize("version", [{}, *({"pytorch-lightning_version": odd} for odd in ("x", 3, None))])
 def test_a_missing_or_odd_version_of_lightning_is_this_one(tmp_path, version):
-    """Lightning would parse it."""
+    """Lightning would otherwise try to parse it."""
     torch.save(content(**version), tmp_path / "a.ckpt")
     loaded = AtomicCheckpointIO().load_checkpoint(tmp_path / "a.ckpt")
     assert loaded["pytorch-lightning_version"] == lightning.pytorch.__version__

@@ -1,4 +1,4 @@
-"""Files of weights that changed, or that unpack without limit, are refused by every reader."""
+"""Weight files that were damaged, or that unpack without limit, are rejected by every reader."""
 
 import tracemalloc
 import zipfile
@@ -21,7 +21,7 @@ from tests.helpers.training import held
 
 
 def flip(path, near):
-    """Flip one bit of the bytes ``near``, which are in the file once."""
+    """Flip one bit of the bytes ``near``, which occur in the file once."""
     data = bytearray(path.read_bytes())
     data[data.index(near) + 1] ^= 0x08
     path.write_bytes(data)
@@ -42,7 +42,7 @@ READERS = {
     [(AtomicCheckpointIO().save_checkpoint, "weights"), (torch.save, "configuration")],
 )
 def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, save, where):
-    """A flipped bit would be a slightly other model in silence."""
+    """A flipped bit would silently change the model."""
     path, made = tmp_path / "last.ckpt", content()
     name = "model.gaussian_head.dpt.projections.0.weight"
     name = name if name in made["state_dict"] else next(n for n in made["state_dict"] if "head" in n)
@@ -68,7 +68,7 @@ def test_the_shipped_file_has_checksums(tmp_path):
 
 
 def packed_again(path, compression):
-    """Write the records of a PyTorch file again, as a program that repairs archives does."""
+    """Rewrite the records of a PyTorch file, as a repair program for archives does."""
     with zipfile.ZipFile(path) as archive:
         records = {record.filename: archive.read(record) for record in archive.infolist()}
     with zipfile.ZipFile(path, "w", compression) as archive:
@@ -77,8 +77,7 @@ def packed_again(path, compression):
 
 
 def claim(path, size):
-    """Let the last record of a PyTorch file say that it has ``size`` bytes,
-    in both of its headers."""
+    """Set the size of the last record of a PyTorch file to ``size`` bytes in both of its headers."""
     with zipfile.ZipFile(path) as archive:
         last = archive.infolist()[-1]
     data, name = bytearray(path.read_bytes()), last.filename.encode()
@@ -93,8 +92,7 @@ FILES_OF_WEIGHTS = {**READERS, "any file of weights": open_file}
 
 @pytest.mark.parametrize("reader", FILES_OF_WEIGHTS)
 def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
-    """PyTorch maps records as they lie on the disk: all weights would be other numbers,
-    in silence."""
+    """PyTorch maps records as stored: all weights would silently be other numbers."""
     path = tmp_path / "a.ckpt"
     torch.save(content(), path)
     packed_again(path, zipfile.ZIP_STORED)

@@ -1,5 +1,4 @@
-"""Weights that do not train are stored once beside the checkpoints of a run,
-which find them anywhere."""
+"""Frozen weights are stored once next to the checkpoints of a run, and found wherever its folder is."""
 
 import os
 import shutil
@@ -45,7 +44,7 @@ def content(model):
 
 @pytest.fixture
 def run(tmp_path):
-    """The folder of two checkpoints of one model, and the model."""
+    """A folder with two checkpoints of one model, and the model."""
     model, files, folder = make_model(FROZEN), AtomicCheckpointIO(), tmp_path / "run" / "checkpoints"
     files.save_checkpoint(content(model), folder / "best.ckpt")
     with torch.no_grad():
@@ -60,7 +59,7 @@ def frozen_file(folder):
 
 
 def test_both_checkpoints_share_one_file(run):
-    """The encoder's bytes are on the disk once; what trains is in each checkpoint."""
+    """The encoder's bytes are on the disk once; trained weights are in each checkpoint."""
     folder, model = run
     assert len(list(folder.iterdir())) == 3
     encoder = sum(value.nbytes for value in model.encoder.parameters())
@@ -73,7 +72,7 @@ def test_both_checkpoints_share_one_file(run):
 
 @pytest.mark.parametrize("reader", READERS)
 def test_every_reader_puts_them_together(run, tmp_path, reader):
-    """Also where the folder was moved; exported files are whole by themselves."""
+    """Also after the folder was moved; exported files are complete."""
     folder, model = run
     moved = tmp_path / "elsewhere"
     shutil.move(folder, moved)
@@ -91,7 +90,7 @@ def missing(path):
 
 
 def other(path):
-    """The right names, and a number that differs."""
+    """Tensors with the right names and one different value."""
     tensors = torch.load(path, weights_only=True)
     next(iter(tensors.values())).view(-1)[0] += 1e-3
     torch.save(tensors, path)
@@ -131,8 +130,7 @@ def test_a_reference_leads_nowhere_else(run, reference):
 
 @pytest.mark.parametrize("links", [True, False])
 def test_runs_of_a_sweep_share_one_copy(tmp_path, monkeypatch, links):
-    """Each has a name of its own for it, where the file system has links:
-    one of them may be deleted."""
+    """If the file system has hard links, each run has a link of its own, and any run may be deleted."""
     model, paths = make_model(FROZEN), [tmp_path / run / "checkpoints" / "last.ckpt" for run in "ab"]
     if not links:
         monkeypatch.setattr(os, "link", lambda *_: os.stat(tmp_path / "none"))

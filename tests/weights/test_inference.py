@@ -19,7 +19,7 @@ from tests.helpers.verbs import ghgs
 
 @pytest.fixture
 def trained(tmp_path):
-    """A checkpoint with what training adds to it."""
+    """A checkpoint with the entries that training adds."""
     path, state = tmp_path / "a.ckpt", make_model().state_dict()
     moments = [{name: tensor.clone() for name, tensor in state.items()} for _ in range(2)]
     write_checkpoint(path, state, config(), optimizer_states=moments, global_step=7)
@@ -28,8 +28,8 @@ def trained(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
 def test_weights_and_configuration_alone_are_written(trained, tmp_path, dtype):
-    """Every tensor is the rounded one; optimizer and progress are gone;
-    the model is built without a YAML."""
+    """Every tensor is the rounded original, optimizer and progress are gone, and the model is built
+    without YAML."""
     write_inference(trained, tmp_path / "b.ckpt", dtype)
     before, after = read_checkpoint(trained), read_checkpoint(tmp_path / "b.ckpt")
     assert set(after) == {"state_dict", "config", "format_version"}
@@ -54,7 +54,7 @@ def test_the_verb_prints_how_far_predictions_are(trained, tmp_path, capsys):
     assert expected in capsys.readouterr().err
     assert ghgs("export", *arguments, "overwrite=true") == 0
     decibels = float(capsys.readouterr().out.split("ellipsoid: ")[1].split(" dB")[0])
-    assert 40 < decibels < 100  # half precision is near, and not the same
+    assert 40 < decibels < 100  # half precision is close, but not equal
 
 
 def test_what_half_precision_cannot_hold_is_refused(tmp_path):
@@ -74,7 +74,8 @@ def test_what_half_precision_cannot_hold_is_refused(tmp_path):
 def test_half_precision_is_computed_where_the_processor_has_it(
     trained, tmp_path, monkeypatch, stored, has_bfloat16
 ):
-    """An encoder in float16 is slow on a CPU; a GPU keeps it, and who asks for it."""
+    """A float16 encoder is slow on a CPU, which loads float32; a GPU keeps float16, and so does an
+    explicit request."""
     monkeypatch.setattr(precision, "has_bfloat16", lambda _: has_bfloat16)
     write_inference(trained, tmp_path / "b.ckpt", str(stored).removeprefix("torch."))
     kept = stored == torch.bfloat16 and has_bfloat16
@@ -88,7 +89,7 @@ def test_half_precision_is_computed_where_the_processor_has_it(
 
 
 def test_the_weights_of_the_package_are_exported_by_name(tmp_path, monkeypatch, capsys):
-    """``checkpoint=shipped`` is no file's path."""
+    """``checkpoint=shipped`` is not a file's path."""
     monkeypatch.chdir(tmp_path)
     assert ghgs("export", "checkpoint=shipped", "inference=half.ckpt", "dtype=float16") == 0
     assert re.search(r"^[\d.]+ MB to [\d.]+ MB$", capsys.readouterr().out, re.MULTILINE)

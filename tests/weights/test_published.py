@@ -1,4 +1,4 @@
-"""Published weights are imported strictly, run, and are exported unchanged; downloads are checked."""
+"""Published weights are imported strictly, predict, and are exported unchanged; downloads are checked."""
 
 import hashlib
 import itertools
@@ -46,7 +46,7 @@ def meta(shapes, prefix=""):
 
 @pytest.mark.parametrize("prefix", ["", "aggregator."])
 def test_the_published_names_and_shapes_are_exactly_the_models(prefix):
-    """The published files must fill the full-size model exactly, tensor by tensor."""
+    """The published files fill the full-size model exactly, tensor by tensor."""
     own = GHGS.from_config(config(tiny=False), empty=True).state_dict()
     assert all(tensor.is_meta for tensor in own.values())
     assert all(name.startswith(VGGT_IGNORED) for name in OTHER_HEADS)
@@ -61,8 +61,7 @@ def test_the_published_names_and_shapes_are_exactly_the_models(prefix):
 
 
 def test_tiny_files_have_the_published_structure():
-    """The small files of these tests must have the structure of the published ones,
-    but for their size."""
+    """The small files of these tests have the structure of the published ones, except for their size."""
     vggt, network = published_tensors()
 
     def kinds(tensors):
@@ -75,7 +74,7 @@ def test_tiny_files_have_the_published_structure():
 
 @pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
 def test_an_imported_model_is_the_published_one_and_is_exported_unchanged(tmp_path, suffix):
-    """A tensor that is renamed wrongly, changed or lost would show here."""
+    """Detects tensors that are renamed wrongly, changed or lost."""
     (vggt, release), (agg, network) = write_published(tmp_path, suffix)
     out = tmp_path / "out.ckpt"
     report = import_weights(config(), out, str(vggt), str(release))
@@ -103,8 +102,8 @@ def test_an_imported_model_is_the_published_one_and_is_exported_unchanged(tmp_pa
 
 
 def test_without_the_release_the_file_holds_the_encoder_alone(monkeypatch, capsys, tmp_path, files):
-    """Heads come from the seed of each training; tables read where the encoder's weights are from; such
-    a file predicts nothing, and what fits is exported."""
+    """Heads are initialised from the seed of each training; tables show the origin of the encoder's
+    weights; such a file cannot predict, and its encoder can be exported."""
     vggt, _, agg, _ = files
     monkeypatch.chdir(tmp_path)
     out, settings = "start.ckpt", config("compat=none", "encoder.trainable=last_1")
@@ -153,7 +152,7 @@ def test_without_the_release_the_file_holds_the_encoder_alone(monkeypatch, capsy
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
 def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
-    """Half precision must reach the encoder alone, and stay close to the float32 model."""
+    """Half precision affects the encoder alone, and stays close to the float32 model."""
     vggt, release, agg, _ = files
     out = tmp_path / "out.ckpt"
     import_weights(config(), out, vggt, release, dtype)
@@ -178,7 +177,7 @@ def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
 
 
 NORM = "blk.norm1.weight"
-#: What changes the release's tensors, and the line that answers it.
+#: Changes of the release's tensors, and the resulting error.
 TAMPERED = [
     (lambda n: n.pop(NORM), rf"{NORM}: expected a tensor of .*\(64,\); .*nothing"),
     (lambda n: n.update({"blk.lam_s": torch.ones(1)}), r"blk\.lam_s: expected no such tensor"),
@@ -195,7 +194,7 @@ TAMPERED = [
 
 @pytest.mark.parametrize(("change", "message"), TAMPERED)
 def test_a_tensor_that_does_not_fit_is_named(tmp_path, files, change, message):
-    """A damaged release must be refused by tensor, and leave no checkpoint."""
+    """A damaged release is rejected with the tensor's name, and no checkpoint is written."""
     network = dict(files[3])
     change(network)
     torch.save({"network": network}, tmp_path / "release.pth")
@@ -216,7 +215,7 @@ def test_a_tensor_that_does_not_fit_is_named(tmp_path, files, change, message):
     ],
 )
 def test_files_in_the_wrong_place_are_refused(monkeypatch, tmp_path, files, vggt, release, out, message):
-    """Exchanged files, missing ones, two tensors for one place, and overwriting the input."""
+    """Swapped files, missing ones, two tensors with one name, and overwriting the input."""
     monkeypatch.chdir(tmp_path)
     twice = {name: tensor.clone() for name, tensor in files[2].items()}
     save_file({**twice, "camera_token": twice["aggregator.camera_token"].clone()}, "twice.safetensors")
@@ -225,7 +224,7 @@ def test_files_in_the_wrong_place_are_refused(monkeypatch, tmp_path, files, vggt
 
 
 def test_models_without_a_published_form_are_not_exported(tmp_path, files):
-    """The message names what differs; nothing is written, and a directory is no file."""
+    """The message names the differences, nothing is written, and a directory is not a file."""
     for name, settings in {
         "guide": config("compat=none", "gaussian_head.guide=true"),
         "hull": models.config("model=hull"),
@@ -248,7 +247,7 @@ def test_models_without_a_published_form_are_not_exported(tmp_path, files):
 
 
 def test_the_verbs(monkeypatch, capsys, tmp_path, files):
-    """The command line must pass its keys on, and print paths last."""
+    """The commands pass their keys on, and print paths last."""
     monkeypatch.chdir(tmp_path)
     given = ["vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY]
     code, out, _ = call(monkeypatch, capsys, "import", *given)
@@ -262,7 +261,7 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
 
 @pytest.mark.parametrize(("skip", "tokens"), [("balanced", "window"), ("fast", "subject"), ("exact", None)])
 def test_fewer_tokens_with_the_authors_weights_give_a_warning(tmp_path, files, skip, tokens):
-    """Their training saw whole photographs: what leaving out patches costs is not known."""
+    """They were trained on whole images: the cost of leaving out patches is unknown."""
     out = tmp_path / "out.ckpt"
     import_weights(config(f"skip={skip}"), out, *files[:2])
     with warnings.catch_warnings(record=True) as seen:
@@ -273,7 +272,7 @@ def test_fewer_tokens_with_the_authors_weights_give_a_warning(tmp_path, files, s
 
 
 def test_switches_that_differ_from_the_releases_are_listed():
-    """Users must learn which parts of a model differ from the authors' code."""
+    """Users are told which parts of a model differ from the authors' code."""
     assert differences(config()) == []
     found = differences(config("unprojection.tokens=subject"))
     assert found == ["unprojection.tokens=subject for release"]
@@ -283,7 +282,7 @@ def test_switches_that_differ_from_the_releases_are_listed():
 
 
 def fake_client(monkeypatch, cached=None, download=None):
-    """A client of the hub whose cache holds ``cached`` and whose download is ``download``."""
+    """A client of the hub whose cache holds ``cached`` and whose download returns ``download``."""
     client = types.ModuleType("huggingface_hub")
     client.hf_hub_url = lambda repository, filename: f"https://hub.test/{repository}/resolve/main/{filename}"
     client.try_to_load_from_cache = lambda repository, filename: cached
@@ -292,7 +291,7 @@ def fake_client(monkeypatch, cached=None, download=None):
 
 
 def cached_file(folder, content, name=None):
-    """A file in the way the client caches it: under its sum, behind a link."""
+    """A file as the client caches it: named by its checksum, behind a link."""
     blob = folder / (name or hashlib.sha256(content).hexdigest())
     blob.write_bytes(content)
     link = folder / "model.safetensors"
@@ -313,8 +312,8 @@ def cached_file(folder, content, name=None):
     ],
 )
 def test_repositories_and_files_are_distinguished(monkeypatch, tmp_path, name, expected):
-    """A file name must not be looked up on the hub, nor a repository on the disk; a file that is named
-    like a repository is a file."""
+    """A file name is not looked up on the hub, nor a repository on the disk; an existing file with a
+    repository's name is a file."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "VGGT-1B").write_bytes(b"x")
@@ -322,7 +321,7 @@ def test_repositories_and_files_are_distinguished(monkeypatch, tmp_path, name, e
 
 
 def test_a_cached_file_needs_no_network_and_a_download_is_checked(monkeypatch, tmp_path):
-    """Weights that were downloaded once must work offline; a broken download is no checkpoint."""
+    """Downloaded weights work offline; a broken download is rejected."""
     path = cached_file(tmp_path, b"weights")
     fake_client(monkeypatch, cached=path)
     _, found, checksum = published.fetch("facebook/VGGT-1B")
@@ -335,8 +334,8 @@ def test_a_cached_file_needs_no_network_and_a_download_is_checked(monkeypatch, t
 
 
 def test_what_the_hub_refuses_is_one_line(monkeypatch):
-    """The client's long answer must become one line that says what to fetch; without the package its
-    extra is named."""
+    """The client's long error becomes one line with the file to fetch; without the package, the error
+    names its extra."""
 
     def refuse(*_):
         raise RuntimeError("Repository Not Found.\nMake sure that you are logged in.")

@@ -28,7 +28,7 @@ def test_predictions_are_of_crops_that_need_no_smaller_copy_though_training_saw_
 
 
 def test_their_figures_are_those_of_the_model_card(tmp_path, monkeypatch):
-    """A file that was exchanged, or a model that has changed, must be noticed."""
+    """Detects a replaced file and changes of the model."""
     monkeypatch.setenv("GHGS_CACHE", str(tmp_path))
     arguments = ["checkpoint=shipped", "data=synthetic", "data.people={train: 1, val: 2}"]
     arguments += ["data.render.positions=[0,2,4,6,8,10,12,14]"]

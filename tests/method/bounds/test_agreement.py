@@ -1,4 +1,4 @@
-"""A mask that contradicts all others has no vote; masks that agree all have one."""
+"""A mask that contradicts all others does not vote; consistent masks all vote."""
 
 import dataclasses
 
@@ -61,13 +61,12 @@ def test_an_empty_mask_has_no_vote_and_takes_none_away():
 
 @pytest.mark.parametrize("wrong", ["half", "shifted"])
 def test_of_two_views_none_loses_its_vote(wrong):
-    """Nobody can tell which one is wrong."""
+    """With two views it is unknown which one is wrong."""
     assert voting(spoil(make_batch(1, 2, 112, 112), wrong)) == [[True, True]]
 
 
 def test_a_wrong_mask_that_is_outvoted_keeps_its_vote():
-    """With a tolerance its word alone carves nothing;
-    without its vote the others would have to agree."""
+    """With a tolerance, its vote alone carves nothing; without it, the others would have to agree."""
     spoiled = spoil(make_batch(1, 5, 112, 112), "half")
     assert voting(spoiled) == [[True] * 4 + [False]]
     assert voting(spoiled, tolerance=1) == [[True] * 5]

@@ -1,4 +1,4 @@
-"""Bounds hold the truth, stay finite, and are as tight as masks and cameras allow."""
+"""Bounds contain the true depth, stay finite, and are as tight as masks and cameras allow."""
 
 import dataclasses
 
@@ -20,13 +20,13 @@ STAGES = [SubjectBox, VisualHull]
 
 
 def near_and_far(stage, batch, **changes):
-    """Both bounds of a batch, some of whose fields are replaced."""
+    """Both bounds of a batch with some fields replaced."""
     bounds = stage(dataclasses.replace(batch, **changes))
     return bounds.near, bounds.far
 
 
 def inside(near, far, batch, slack=1e-4):
-    """Part of the subject's pixels whose true depth lies within the bounds."""
+    """Fraction of the subject's pixels whose true depth lies within the bounds."""
     good = (near <= batch.depths + slack) & (batch.depths <= far + slack)
     return good[batch.masks].float().mean().item()
 
@@ -45,7 +45,7 @@ def test_true_depth_is_within_the_bounds(stage, views, size):
 
 @pytest.mark.parametrize("resolution", [30, 50, 160])
 def test_a_coarse_search_stays_conservative(resolution, monkeypatch):
-    """A low resolution of the search may widen the bounds, never cut the subject off."""
+    """A low search resolution may widen the bounds, but never cut the subject off."""
     monkeypatch.setattr("ghgs_lit.method.bounds.box.RESOLUTION", resolution)
     batch = make_batch(1, 4, 112, 112)
     near, far = near_and_far(VisualHull(), batch)
@@ -56,7 +56,7 @@ def test_a_coarse_search_stays_conservative(resolution, monkeypatch):
 
 
 def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
-    """A hull as wide as the box would cost its time for nothing."""
+    """A hull as wide as the box would not be worth its time."""
     batch = make_batch(1, 5, 112, 112)
     lengths = {}
     for stage in STAGES:
@@ -67,7 +67,7 @@ def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
 
 
 def test_the_box_holds_the_subject_and_little_more():
-    """The carved box must neither cut the subject nor keep the empty space around it."""
+    """The carved box neither cuts the subject nor keeps the empty space around it."""
     batch = make_batch(2, 4, 112, 112)
     lower, upper = subject_box(batch.masks, batch.cameras, radius=1)
     assert (lower <= CENTER - RADII).all()
@@ -77,7 +77,7 @@ def test_the_box_holds_the_subject_and_little_more():
 
 
 def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
-    """What lies outside a view's frame must not count as empty."""
+    """Space outside a view's frame does not count as empty."""
     batch = make_batch(1, 4, 56, 56, zoom=1.6)
     assert batch.masks[:, :, 0].any(), "the head must touch the border in this test"
     for stage in STAGES:
@@ -86,7 +86,7 @@ def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
 
 @pytest.mark.parametrize("view", [1, 3])
 def test_legs_below_one_frame_are_kept_for_the_other_views(view):
-    """One leg stands before the other: below the frame they do not run straight down."""
+    """One leg is in front of the other: below the frame they do not continue straight down."""
     cameras = camera_ring(4, 84, 84, focal=(92.0, 92.0), center=(0, 0.9, 0), raised=0.4, radius=2.4)
     intrinsics = cameras.intrinsics.clone()
     intrinsics[0, view, 1, 2] += 44
@@ -100,7 +100,7 @@ def test_legs_below_one_frame_are_kept_for_the_other_views(view):
 
 
 def test_a_frame_that_cuts_nothing_says_what_is_outside():
-    """Beyond a side that the subject touches anything may be; beyond the others nothing is."""
+    """Beyond a side that the subject touches, space is unknown; beyond the others it is empty."""
     masks = torch.zeros(1, 2, 6, 8, dtype=torch.bool)
     masks[0, 0, 2:4, :3] = True
     masks[0, 1, 2:4, 2:5] = True
@@ -138,7 +138,7 @@ def test_an_empty_mask_does_not_vote(stage):
 
 
 def test_tolerance_outvotes_a_wrong_mask():
-    """One wrong mask must not cut off what the other views see."""
+    """One wrong mask does not cut off parts that the other views show."""
     batch = make_batch(1, 5, 56, 56)
     wrong = batch.masks.clone()
     wrong[0, 2, 20:] = False  # one view has lost everything below the head
@@ -151,7 +151,7 @@ def test_tolerance_outvotes_a_wrong_mask():
 
 
 def test_masks_that_contradict_one_another_fall_back_to_the_box():
-    """An empty hull must give finite bounds, not NaN."""
+    """An empty hull gives finite bounds, not NaN."""
     batch = make_batch(1, 3, 56, 56)
     masks = torch.zeros_like(batch.masks)
     masks[0, 0, :6, :6] = masks[0, 1, -6:, -6:] = masks[0, 2, :6, -6:] = True
@@ -161,7 +161,7 @@ def test_masks_that_contradict_one_another_fall_back_to_the_box():
 
 
 def test_depths_in_a_box_end_on_its_faces():
-    """Entry and exit of a ray must lie on the box."""
+    """Entry and exit points of a ray lie on the box."""
     cameras = ring(2, 3, 28, 42)
     lower, upper = torch.tensor([[-0.3, 0.2, -0.4]] * 2), torch.tensor([[0.5, 1.6, 0.3]] * 2)
     bounds = depths_in_box(cameras, lower, upper)
@@ -174,7 +174,7 @@ def test_depths_in_a_box_end_on_its_faces():
 
 @pytest.mark.parametrize("radius", [0, 1, 3, 40])
 def test_dilation_is_a_maximum_over_a_square(radius):
-    """The fast dilation must equal its definition at every radius."""
+    """The fast dilation equals its definition at every radius."""
     masks = torch.rand(2, 3, 17, 23, generator=torch.Generator().manual_seed(0)) > 0.97
     padded = F.pad(masks.float(), (radius,) * 4)
     expected = padded.unfold(-2, 2 * radius + 1, 1).unfold(-2, 2 * radius + 1, 1).amax((-1, -2)).bool()
@@ -183,7 +183,7 @@ def test_dilation_is_a_maximum_over_a_square(radius):
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
 def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
-    """Cameras in other units must not overflow into NaN bounds."""
+    """Cameras in other units do not overflow into NaN bounds."""
     batch = make_batch(1, 3)
     cameras = batch.cameras
     for name, index in (("intrinsics", (..., [0, 1], [0, 1])), ("extrinsics", (..., slice(3), 3))):
@@ -211,14 +211,14 @@ def test_autocast_changes_nothing():
     [({"tolerance": -1}, "tolerance"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
 )
 def test_impossible_options_are_refused(option, key):
-    """A bad value is found when the configuration is read, by its key."""
+    """An invalid value is rejected when the configuration is read, by key."""
     with pytest.raises(InputError, match=rf"bounds\.{key}"):
         VisualHull(**option)
 
 
 @pytest.mark.parametrize("size", [(40, 160), (160, 40)])
 def test_dilation_is_a_share_of_the_longer_side(size):
-    """In whole cells, at the resolution of the search, of upright and lying photographs."""
+    """Dilation is rounded to whole cells of the search, for upright and landscape images."""
     masks = torch.zeros(1, 2, *size, dtype=torch.bool)
     for resolution, stride, dilation in ((160, 1, 8), (80, 2, 4)):
         found = silhouettes(masks, ring(1, 2, *size), resolution, 0.05)
@@ -237,7 +237,7 @@ def test_the_box_has_a_margin_on_every_side(monkeypatch):
 
 @pytest.mark.parametrize("stretch", [(2.0, 1.0), (1.0, 2.0)])
 def test_the_box_of_pixels_that_are_not_square(stretch):
-    """Photographs that are stretched along x or y show the same pole in the same box."""
+    """Images stretched along x or y give the same box for the same pole."""
     radii = torch.tensor([0.1, 0.8, 0.1])
     across, down = stretch
     focal, principal = (45 * across, 45 * down), (28 * across, 28 * down)
@@ -251,7 +251,7 @@ def test_the_box_of_pixels_that_are_not_square(stretch):
 
 
 def test_bounds_that_are_too_close_are_moved_apart_to_the_least_thickness():
-    """By as much on either side, and not past the camera; others stay."""
+    """By equal amounts on both sides, but not past the camera; others stay."""
     near, far = torch.tensor([[2.0, 2.0, 0.1, torch.nan], [2.004, 2.5, 0.1, torch.inf]])[:, None, None, None]
     found = SubjectBox()._valid(DepthBounds(near, far))
     torch.testing.assert_close(found.near.flatten(), torch.tensor([1.992, 2.0, 0.1, 0.1]))

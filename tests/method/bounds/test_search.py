@@ -1,4 +1,4 @@
-"""The search along rays against the masks looked up ray by ray."""
+"""The search along rays, against masks looked up ray by ray."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from tests.helpers.scenes import make_batch
 
 
 def by_hand(batch, start, tolerance, samples, v, row, column):
-    """First and last allowed depth of one ray in float64;
-    undilated masks, no ray leaves the frames."""
+    """First and last allowed depths of one ray in float64; masks are not dilated, and no ray leaves the
+    frames."""
     masks = batch.masks[0].numpy()
     intrinsics, extrinsics = (
         x[0].double().numpy() for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)
@@ -34,7 +34,7 @@ def by_hand(batch, start, tolerance, samples, v, row, column):
 @pytest.mark.parametrize("by_kernel", [True, False])
 @pytest.mark.parametrize("tolerance", [0, 1])
 def test_a_ray_ends_where_the_masks_of_the_other_views_end(monkeypatch, tolerance, by_kernel):
-    """Both searches against the definition of the hull, ray by ray."""
+    """Both searches equal the definition of the hull, ray by ray."""
     if not by_kernel:
         monkeypatch.setitem(march.fits, "cpu", lambda *_: False)
     batch = make_batch(1, 4, 56, 70, zoom=0.6)

@@ -1,4 +1,4 @@
-"""Properties of the encoder that no single number shows."""
+"""Properties of the encoder beyond reference numbers."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def _options(name: str) -> dict:
 
 @pytest.mark.parametrize(("name", "most"), [("vggt_nano", 1.2e6), ("vggt_small", 6.5e6)])
 def test_small_encoders_fit_their_size(name, most):
-    """The small encoders must stay small and train in every parameter."""
+    """The small encoders stay small, and every parameter gets a gradient."""
     encoder = make_encoder(**_options(name))
     assert sum(p.numel() for p in encoder.parameters()) < most
     assert len(encoder.aggregator.layers) == 4
@@ -53,7 +53,7 @@ def test_small_encoders_fit_their_size(name, most):
 
 
 def test_every_shipped_size_builds():
-    """Every option of conf/encoder must be a valid encoder."""
+    """Every file of conf/encoder is a valid encoder."""
     names = sorted(path.stem for path in (CONF / "encoder").glob("*.yaml"))
     assert names == ["vggt_1b", "vggt_nano", "vggt_small"]
     with torch.device("meta"):
@@ -64,7 +64,7 @@ def test_every_shipped_size_builds():
 @pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
 @pytest.mark.parametrize("mask_input", [False, True])
 def test_any_patch_size_and_shape(patch_size, mask_input):
-    """Tokens must be complete, in order, and see the mask only with mask_input."""
+    """Tokens are complete and in order, and depend on the mask only with mask_input."""
     encoder = _encoder(patch_size=patch_size, mask_input=mask_input)
     images, masks = _views(2, 3, 2 * patch_size, 3 * patch_size)
     tokens = encoder(images, masks)
@@ -78,22 +78,22 @@ def test_any_patch_size_and_shape(patch_size, mask_input):
 
 
 def test_images_that_are_wider_than_the_weights_are_named():
-    """They would end in a convolution of one of the heads."""
+    """Otherwise the error would come from a convolution of a head."""
     images, masks = _views(1, 2, 28, 28)
     with pytest.raises(InputError, match=r"images: expected float32 .*; found torch\.float64"):
         _encoder()(images.double(), masks)
 
 
 def test_semantic_features_carry_no_gradient():
-    """Semantic features weight the attention; they are not trained through it."""
+    """Semantic features weight the attention, and are not trained through it."""
     tokens = _encoder()(*_views(1, 2, 28, 28))
     assert not tokens.semantic.requires_grad
     assert tokens.latent[0].requires_grad
 
 
 def test_low_precision_stays_near_float32():
-    """Angles, norms and the residual stream are wide: bfloat16 loses what its products lose,
-    no more."""
+    """Angles, norms and the residual stream are float32: bfloat16 loses only the precision of its
+    products."""
     encoder = _encoder(depth=4, layers=(3,))
     images, masks = _views(1, 3, 140, 140)
     with torch.no_grad():
@@ -122,7 +122,7 @@ def test_angles_are_float32_whatever_the_tokens():
     "vit", [SMALL["vit"], {"kind": "dinov2", "depth": 1, "heads": 2}], ids=["stem", "dinov2"]
 )
 def test_special_tokens_are_drawn_near_zero(vit):
-    """As published, and the semantic branch's token as wide as the weights of its blocks."""
+    """As published; the semantic branch's token has the spread of its blocks' weights."""
     semantic = {"width": 32, "depth": 1, "heads": 2, "channels": 8}
     torch.manual_seed(0)
     encoder = make_encoder(**{**SMALL, "vit": vit, "semantic": semantic})
@@ -165,6 +165,6 @@ def test_normalisation_is_no_part_of_a_checkpoint():
     ],
 )
 def test_impossible_options_are_refused(options, message):
-    """A bad value is found when the configuration is read, by its key."""
+    """An invalid value is rejected when the configuration is read, by key."""
     with pytest.raises(InputError, match=message):
         make_encoder(**{**SMALL, **options})

@@ -1,4 +1,4 @@
-"""Patches that leave before the first block, against masked attention in float64."""
+"""Patches dropped before the first block, against masked attention in float64."""
 
 import pytest
 import torch
@@ -16,8 +16,7 @@ VITS = [{"kind": "conv"}, {"kind": "stem", "channels": 8}, {"kind": "dinov2", "d
 
 
 def _encoder(vit=VITS[0], **options) -> VGGTEncoder:
-    """A small encoder in float64 whose special tokens and LayerScales are large enough to
-    matter."""
+    """A small encoder in float64 whose special tokens and LayerScales are large enough to matter."""
     torch.manual_seed(0)
     options = {"tokens": "subject", **options}
     encoder = make_encoder(width=32, heads=2, depth=2, layers=(0, 1), vit=vit, image_size=42, **options)
@@ -29,8 +28,8 @@ def _encoder(vit=VITS[0], **options) -> VGGTEncoder:
 
 
 def _people() -> tuple[torch.Tensor, torch.Tensor]:
-    """Images and masks [2, 4, ...]: two people, a single pixel, an empty view, one at the border,
-    ..."""
+    """Images and masks [2, 4, ...]: two people, a single pixel, an empty view, one at the border, and
+    more."""
     masks = torch.zeros(2, 4, PATCH * ROWS, PATCH * COLUMNS, dtype=torch.bool)
     masks[0, 0, 10:20, 3:20] = masks[0, 0, 40:50, 80:90] = True  # two people
     masks[0, 1, 31, 44] = True  # a single pixel; view 2 is empty
@@ -42,7 +41,7 @@ def _people() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _kept_slowly(mask: torch.Tensor, margin: int, window: bool = False) -> torch.Tensor:
-    """Patches that are kept, one by one."""
+    """Kept patches, by a loop."""
     touched = torch.tensor(
         [
             [
@@ -66,7 +65,7 @@ def _kept_slowly(mask: torch.Tensor, margin: int, window: bool = False) -> torch
 
 
 def _masked_block(block, x, keys, rotary=None):
-    """A block on padded sequences [n, t, c] whose attention sees ``keys`` [n, t] only."""
+    """A block on padded sequences [n, t, c] whose attention is restricted to ``keys`` [n, t]."""
     n, t, c = x.shape
     attention = block.attn
     qkv = attention.qkv(block.norm1(x)).view(n, t, 3, attention.heads, -1).permute(2, 0, 3, 1, 4)
@@ -80,8 +79,7 @@ def _masked_block(block, x, keys, rotary=None):
 
 
 def _masked_encoder(encoder, images, kept):
-    """Latents [V, P, 2 C] of each layer and features [V, P, C] of one element,
-    from all its tokens."""
+    """Latents [V, P, 2 C] of each layer and features [V, P, C] of one element, from all its tokens."""
     aggregator = encoder.aggregator
     v, special = len(images), aggregator.special
     keys = torch.cat((torch.ones(v, special, dtype=torch.bool), kept.flatten(1)), dim=1)
@@ -123,8 +121,8 @@ def _same(a, b):
 )
 @torch.no_grad()
 def test_background_is_as_if_no_attention_saw_it(vit, tokens, margin):
-    """Kept tokens have their true positions, and nothing depends on those that left. The reference
-    computes each element alone, frame attention in each view, and special tokens of a first view."""
+    """Kept tokens have their true positions and do not depend on dropped ones. The reference computes
+    each element alone, with frame attention per view and the special tokens of a first view."""
     encoder = _encoder(vit, tokens=tokens, margin=margin)
     images, masks = _people()
     seen = torch.ones_like(masks) if tokens == "all" else masks
@@ -145,7 +143,7 @@ def test_background_is_as_if_no_attention_saw_it(vit, tokens, margin):
 
 @torch.no_grad()
 def test_kept_patches_that_are_given_take_part():
-    """Patches of the plan, not the encoder's own choice, become tokens."""
+    """The plan's patches become tokens, not the encoder's own choice."""
     encoder, (images, masks) = _encoder(VITS[2]), _people()
     kept = torch.stack((patches_in_window(masks, PATCH, 0)[0], patches_around_subject(masks, PATCH, 1)[1]))
     found = encoder(images, masks, plan=make_plan(masks, PATCH, kept))
@@ -159,7 +157,7 @@ def test_kept_patches_that_are_given_take_part():
 
 @torch.no_grad()
 def test_without_a_subject_there_are_no_tokens():
-    """An encoder that sees no subject gives no tokens, and no error."""
+    """Without a subject, the encoder returns no tokens and raises no error."""
     images, masks = _people()
     tokens = _encoder(VITS[2])(images, torch.zeros_like(masks))
     assert tokens.latent[0].shape == (0, 64)
@@ -184,5 +182,5 @@ def test_gradients_are_finite_and_those_of_masked_attention(vit, checkpointing):
     ).backward()
     for name, grad in found.items():
         expected = encoder.get_parameter(name).grad
-        # Position embeddings are resampled in float32, and so are their gradients.
+        # Position embeddings and their gradients are resampled in float32.
         torch.testing.assert_close(grad, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))

@@ -1,8 +1,8 @@
 """Encoder and dense head against numbers of the published architecture (random weights, CPU).
 
 ``fixtures/<case>.safetensors`` contains ``state/``, ``in/``, ``out/`` (float32) and ``out64/``
-(float64, with the tables that are float32 here in float32, too); ``encoder_cases.json`` has options
-and float32 bounds.
+(float64, except for tables that are float32 here, too); ``encoder_cases.json`` contains options and
+float32 bounds.
 """
 
 import gzip
@@ -49,8 +49,8 @@ def _options(name: str) -> dict:
 def _compare(name: str, groups: dict, dtype: torch.dtype, found: dict[str, torch.Tensor]) -> None:
     expected = groups[DTYPES[dtype]]
     assert set(found) == set(expected)
-    # Position tables of another size are interpolated in float32, also for float64: each entry is a
-    # sum whose order is the processor's, as is that of their effect on tokens.
+    # Position tables of another size are interpolated in float32, even for float64: each entry is a sum
+    # whose order depends on the processor, and so do tokens.
     is_interpolated = "interp" in name or "same_count" in name
     share = 4 * torch.finfo(torch.float32).eps if is_interpolated else 1e-9
     for key, value in found.items():
@@ -68,7 +68,7 @@ def _names(prefix: str) -> list[str]:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", _names("vit_"))
 def test_vit(name, dtype):
-    """The DINOv2 ViT reproduces the published architecture's numbers."""
+    """The DINOv2 ViT reproduces the numbers of the published architecture."""
     groups = _load(name)
     vit = VisionTransformer(3, patch_size=14, **_options(name))
     vit.load_state_dict(groups["state"])
@@ -85,8 +85,7 @@ def test_vit(name, dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", _names("agg_"))
 def test_encoder(name, dtype):
-    """The aggregator reproduces the published numbers,
-    and the encoder reads the right tokens out of it."""
+    """The aggregator reproduces the published numbers, and the encoder reads out the right tokens."""
     groups = _load(name)
     encoder = make_encoder(**_options(name))
     encoder.aggregator.load_state_dict(groups["state"])
@@ -168,7 +167,7 @@ def test_activations(dtype):
 
 
 def test_published_names_and_shapes():
-    """Published weights fit: names and shapes of all parameters are unchanged."""
+    """Names and shapes of all parameters are those of the published weights."""
     with gzip.open(FIXTURES / "encoder_keys.json.gz") as file:
         published = json.load(file)
     with torch.device("meta"):

@@ -1,5 +1,4 @@
-"""Attention reaches PyTorch's fused kernels:
-which of them run on a GPU depends on how they are asked."""
+"""Attention meets the requirements of PyTorch's fused kernels on a GPU."""
 
 import pytest
 import torch
@@ -13,10 +12,9 @@ attention = F.scaled_dot_product_attention
 @pytest.mark.parametrize("autocast", [False, True])
 @pytest.mark.parametrize("tokens", ["all", "subject"])
 def test_attention_is_asked_for_what_fused_kernels_take(tokens, autocast, monkeypatch):
-    """One dtype, channels innermost, heads of whole vectors, no mask:
-    what fused kernels of a GPU ask for.
+    """Requirements of fused GPU kernels: one dtype, channels innermost, heads of whole vectors, no mask.
 
-    Views of one length share a call; others have one each, and none is padded.
+    Views of equal length share a call, others have one each, and none is padded.
     """
     calls = []
 
@@ -31,7 +29,7 @@ def test_attention_is_asked_for_what_fused_kernels_take(tokens, autocast, monkey
     for number, mask in enumerate(masks.flatten(0, 1)):
         mask[20 : 24 + 5 * number, 20:30] = True
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-        encoder(images, masks)  # with a gradient: PyTorch's own attention
+        encoder(images, masks)  # with a gradient, PyTorch's attention is used
     for q, k, v, mask, options in calls:
         assert q.dtype == k.dtype == v.dtype == (torch.bfloat16 if autocast else torch.float32)
         assert q.stride(-1) == k.stride(-1) == v.stride(-1) == 1
@@ -49,6 +47,6 @@ def test_attention_is_asked_for_what_fused_kernels_take(tokens, autocast, monkey
 
 @pytest.mark.parametrize("name", ["vggt_nano", "vggt_small", "vggt_1b"])
 def test_head_widths_fit_fused_kernels(name):
-    """They take multiples of 8."""
+    """Fused kernels require multiples of 8."""
     node = compose("train", [f"encoder={name}"])["encoder"]
     assert node["width"] // node["heads"] % 8 == 0

@@ -1,4 +1,4 @@
-"""The convolutional stem sees the patches that are kept and what these depend on, no more."""
+"""The convolutional stem reads only kept patches and those in their receptive field."""
 
 import pytest
 import torch
@@ -29,7 +29,7 @@ def test_kept_patches_have_the_tokens_of_whole_images(patch_size, places):
 
 
 def test_what_kept_patches_do_not_depend_on_is_not_seen():
-    """NaN would reach every token through a sum."""
+    """NaN in other patches would reach every token through a sum."""
     stem, some = ConvStem(5, 16, 14, 8), kept((0, 0, 4, 5))
     images = torch.full((4, 5, 126, 154), torch.nan)
     images[..., 2 * 14 : 7 * 14, 3 * 14 : 8 * 14] = 0.5
@@ -41,8 +41,8 @@ def test_no_kept_patch():
 
 
 def test_the_box_holds_the_kept_patches_of_all_images():
-    """With a margin as far as the grid goes;
-    of none it is a patch, through which gradients of 0 flow."""
+    """The margin is clipped to the grid; without kept patches the box is one patch, through which
+    gradients of 0 flow."""
     assert kept((0, 0, 3, 4), (1, 1, 5, 2)).box(1) == (slice(2, 7), slice(1, 6))
     assert kept((0, 1, 0, 10), (1, 0, 8, 9)).box(2) == (slice(0, 9), slice(7, 11))
     assert kept().box(0) == (slice(0, 1), slice(0, 1))

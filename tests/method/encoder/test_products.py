@@ -1,4 +1,4 @@
-"""The fast paths on a CPU against plain PyTorch, half precision, and what must not change."""
+"""The fast paths on a CPU against plain PyTorch, half precision, and invariants."""
 
 import pytest
 import torch
@@ -32,8 +32,7 @@ def convolutions(monkeypatch):
 
 @pytest.fixture
 def kernels(monkeypatch):
-    """Use the attention kernel for any size,
-    also where the processor lacks features that make it fast."""
+    """Use the attention kernel for any size, even where the processor lacks features that make it fast."""
     features = processor_features() | {"avx2", "fma"}
     for limit in ("_SMALL", "_LARGE"):
         monkeypatch.setattr(f"ghgs_lit.ops.attention.{limit}", 0)
@@ -47,7 +46,7 @@ def kernels(monkeypatch):
 @pytest.mark.parametrize("shape", [(7, 12), (2, 5, 12), (2, 3, 4, 12), (1, 12)])
 @pytest.mark.parametrize("bias", [False, True])
 def test_product_is_the_linear_layer(convolutions, monkeypatch, shape, bias):
-    """A product computed as a convolution equals the linear layer, values and gradients; so does one
+    """A product computed as a convolution equals the linear layer in values and gradients; so does one
     without a gradient."""
     g = torch.Generator().manual_seed(0)
     x, weight, b = (torch.randn(s, generator=g, requires_grad=True) for s in (shape, (9, 12), (9,)))
@@ -68,8 +67,8 @@ def test_product_is_the_linear_layer(convolutions, monkeypatch, shape, bias):
 
 
 def test_which_products_are_onednns(monkeypatch):
-    """Those of a processor with wide vectors, but for tiny ones, in float32,
-    in training with two threads."""
+    """On processors with wide vectors, all but tiny products, in float32; in training with two threads or
+    more."""
     monkeypatch.setattr(ghgs_lit.ops.linear, "_WIDE_PRODUCTS", True)
     threads, x, weight = torch.get_num_threads(), torch.empty(1000, 512), torch.empty(64, 512)
     prefers = ghgs_lit.ops.linear.prefers_onednn
@@ -91,7 +90,7 @@ def test_which_products_are_onednns(monkeypatch):
 
 @pytest.mark.parametrize(("rows", "calls"), [(11, 5), (12, 1), (40, 1)])
 def test_weights_of_products_of_few_rows_are_copied_in_parts(convolutions, monkeypatch, rows, calls):
-    """Large weights with few rows are divided, so that oneDNN's copy does not fill the memory."""
+    """Large weights with few rows are split, so that oneDNN's copy does not fill the memory."""
     monkeypatch.setattr(ghgs_lit.ops.linear, "_COPY", 24)
     g = torch.Generator().manual_seed(0)
     x, weight, b = (torch.randn(s, generator=g) for s in ((rows, 12), (9, 12), (9,)))
@@ -110,7 +109,7 @@ def test_product_of_other_kinds_is_left_alone(convolutions):
 
 
 def test_even_parts_cover_all_rows():
-    """Parts cover every row once, keep the size limit and differ by at most one row."""
+    """Parts cover every row once, respect the size limit and differ by at most one row."""
     for count in (0, 1, 5, 16, 17):
         for most in (0, 1, 4, 100):
             parts = even_parts(count, most)
@@ -125,8 +124,7 @@ def test_even_parts_cover_all_rows():
 def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
     convolutions, kernels, monkeypatch, qk_norm
 ):
-    """The in-place path without a gradient gives the same result and does not
-    overwrite its input."""
+    """The in-place path without a gradient gives the same result and does not overwrite its input."""
     monkeypatch.setattr("ghgs_lit.method.encoder.block._HIDDEN", 200)
     torch.manual_seed(0)
     block = Block(64, 2, qk_norm, 1e-5, 0.5)
@@ -145,8 +143,7 @@ def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
 
 @pytest.mark.parametrize("tokens", ["all", "subject"])
 def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels, tokens):
-    """All fast paths together do not change the encoder's tokens,
-    with views of any number of tokens."""
+    """All fast paths together do not change the encoder's tokens, for views with any number of tokens."""
     torch.manual_seed(0)
     vit = {"kind": "dinov2", "depth": 2, "heads": 2}
     options = {"image_size": 28, "layer_scale": 0.5, "tokens": tokens, "margin": 0}
@@ -250,7 +247,7 @@ def test_precision_that_a_device_lacks_is_refused(monkeypatch):
 
 
 def test_checkpointing_keeps_fewer_bytes_and_the_same_gradients():
-    """Recomputing activations saves memory and leaves the gradients bit for bit the same."""
+    """Recomputing activations saves memory, with bit-identical gradients."""
     found = {}
     for checkpointing in (False, True):
         torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""The semantic branch: features of single views that no choice of tokens changes."""
+"""The semantic branch: features of single views, independent of the choice of tokens."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ SMALL = {"width": 32, "heads": 2, "depth": 1, "layers": (0,), "vit": {"kind": "s
 
 
 def make(**options) -> VGGTEncoder:
-    """An encoder in float64 whose branch's token and LayerScales are large enough to matter."""
+    """An encoder in float64 whose branch token and LayerScales are large enough to matter."""
     torch.manual_seed(0)
     encoder = make_encoder(**{**SMALL, "semantic": BRANCH, **options}).double()
     with torch.no_grad():
@@ -26,7 +26,7 @@ def make(**options) -> VGGTEncoder:
 
 
 def views(b=2, v=3, seed=1):
-    """Photographs of 4 x 5 patches; the subject has another outline in each."""
+    """Images of 4 x 5 patches with a different outline of the subject in each."""
     g = torch.Generator().manual_seed(seed)
     masks = torch.zeros(b, v, 56, 70, dtype=torch.bool)
     for n, mask in enumerate(masks.flatten(0, 1)):
@@ -35,7 +35,7 @@ def views(b=2, v=3, seed=1):
 
 
 def of_subject(encoder, images, masks, **choice):
-    """Semantic features of the subject's patches, for a choice of tokens."""
+    """Semantic features of the subject's patches for a choice of tokens."""
     for name, value in choice.items():
         setattr(encoder, name, value)
     tokens = encoder(images, masks)
@@ -45,7 +45,7 @@ def of_subject(encoder, images, masks, **choice):
 
 @pytest.mark.parametrize(("tokens", "margin"), [("window", 0), ("window", 2), ("subject", 0), ("subject", 1)])
 def test_no_choice_of_tokens_changes_a_feature(tokens, margin):
-    """A preset of skip that changed the features would change which neighbours count."""
+    """A preset of skip that changed the features would change the attention."""
     encoder, (images, masks) = make(), views()
     expected = of_subject(encoder, images, masks)
     found = of_subject(encoder, images, masks, tokens=tokens, margin=margin)
@@ -53,7 +53,7 @@ def test_no_choice_of_tokens_changes_a_feature(tokens, margin):
 
 
 def test_a_feature_depends_on_its_own_photograph_and_mask_alone():
-    """Other views and batch mates must not matter; the photograph's other end and the mask must."""
+    """Other views and batch mates have no influence; the far end of the image and the mask do."""
     encoder, (images, masks) = make(), views()
     together = of_subject(encoder, images, masks)
     alone = torch.cat(
@@ -76,7 +76,7 @@ def test_a_feature_depends_on_its_own_photograph_and_mask_alone():
 
 
 def test_where_there_is_no_subject_features_are_zero():
-    """Background is consistent with nothing, and a view without a subject is none of an error."""
+    """Background is consistent with nothing, and a view without a subject is not an error."""
     encoder, (images, masks) = make(), views()
     masks[0, 1] = False
     semantic = encoder(images, masks).semantic.unflatten(0, (2, 3, 4, 5))
@@ -88,8 +88,7 @@ def test_where_there_is_no_subject_features_are_zero():
 
 
 def test_the_consistency_of_two_patches_is_the_overlap_of_their_parts():
-    """The cosine that weights the attention (Eq. 4) must be 1 for equal shares and 0 for
-    disjoint ones."""
+    """The cosine that weights the attention (Eq. 4) is 1 for equal shares and 0 for disjoint ones."""
     encoder, (images, masks) = make(), views()
     with torch.no_grad():
         encoder.semantic.head.weight.mul_(5)
@@ -103,7 +102,7 @@ def test_the_consistency_of_two_patches_is_the_overlap_of_their_parts():
 
 
 def test_the_branch_does_not_learn_and_the_rest_does():
-    """A feature that learned with the loss of the rendering would hold no parts any more."""
+    """If features were trained with the rendering loss, they would no longer represent parts."""
     encoder, (images, masks) = make(), views()
     tokens = encoder(images, masks)
     assert not tokens.semantic.requires_grad
@@ -126,13 +125,13 @@ def test_the_branch_does_not_learn_and_the_rest_does():
     ],
 )
 def test_impossible_options_are_refused(change, message):
-    """A bad value is found when the configuration is read, by its key."""
+    """An invalid value is rejected when the configuration is read, by key."""
     with pytest.raises(InputError, match=message):
         make_encoder(**SMALL, semantic={**BRANCH, **change})
 
 
 def test_half_precision_weights_run():
-    """Features are float32 whatever the weights are: the shares of a patch add up to 1."""
+    """Features are float32 for weights of any dtype, so the shares of a patch add up to 1."""
     encoder, (images, masks) = make(), views()
     full = of_subject(encoder, images, masks)
     half = of_subject(encoder.bfloat16(), images.float(), masks)

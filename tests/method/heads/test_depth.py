@@ -1,4 +1,4 @@
-"""Depths: parameterizations, bounds, the dense head around them."""
+"""Depths: parameterizations, bounds, and the dense head."""
 
 import pytest
 import torch
@@ -46,7 +46,7 @@ def square_cameras(name, dtype, size):
 
 
 def assert_points(found, expected):
-    """The bound for points: relative to the norm of each point."""
+    """Compares points with a bound relative to the norm of each point."""
     error = (found.double() - expected).norm(dim=-1)
     limit = 2e-5 if found.dtype == torch.float32 else 1e-9
     assert (error <= limit * expected.norm(dim=-1)).all()
@@ -54,7 +54,7 @@ def assert_points(found, expected):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_pixel_points_match_the_release(dtype):
-    """World points of pixels must be those of the authors' code."""
+    """World points of pixels equal those of the authors' code."""
     inputs, cameras = square_cameras("depth2pts", dtype, 40)
     points = unproject_maps(inverse_linear(inputs["inv_depth"]), cameras)[0]
     assert_points(points, fixture("depth2pts", "out64", torch.float64)["points"])
@@ -62,7 +62,7 @@ def test_pixel_points_match_the_release(dtype):
 
 @pytest.mark.parametrize("name", list(BOUNDED))
 def test_parameterizations_stay_in_bounds_and_keep_their_gradient(name):
-    """No raw value may leave the bounds or lose its gradient."""
+    """No raw value leaves the bounds or loses its gradient."""
     near, far = torch.tensor([0.1, 1.5, 2.0])[:, None], torch.tensor([100.0, 2.5, 2.02])[:, None]
     raw = torch.linspace(-200, 200, 41).requires_grad_()
     depth = BOUNDED[name](raw.sigmoid(), near, far)
@@ -82,7 +82,7 @@ def test_parameterizations_stay_in_bounds_and_keep_their_gradient(name):
 @pytest.mark.parametrize("bounds", [SubjectBox(), VisualHull()])
 @pytest.mark.parametrize("name", list(BOUNDED))
 def test_head_starts_at_a_fraction_of_its_bounds(name, bounds):
-    """Training must start inside the bounds, where `start` says."""
+    """Initial depths lie inside the bounds, at ``start``."""
     batch = make_batch(2, 3)
     maps = predict(make_head(parameterization=name, start=0.4), batch, bounds)
     torch.testing.assert_close(
@@ -110,7 +110,7 @@ def test_depth_is_wide_under_autocast():
 
 
 def test_values_that_are_not_finite_are_invalid_and_finite():
-    """A NaN of the network must not spread into the points."""
+    """A NaN of the network does not spread into the points."""
     batch = make_batch()
     head = make_head()
     with torch.no_grad():
@@ -138,6 +138,6 @@ def test_the_releases_parameterization_has_either_sign_and_no_bounds():
     ],
 )
 def test_impossible_options_are_refused(options, key):
-    """A bad value is found when the configuration is read, by its key."""
+    """An invalid value is rejected when the configuration is read, by key."""
     with pytest.raises(InputError, match=key):
         make_head(**options)

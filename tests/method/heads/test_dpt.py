@@ -29,7 +29,7 @@ def _head(seed=0, features=8, out_channels=(4, 8, 8, 12), **options) -> DPTHead:
 @pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
 @pytest.mark.parametrize("grid", [(1, 1), (3, 2), (2, 5)])
 def test_any_patch_size_and_grid(patch_size, grid):
-    """The head must serve encoders of other patch sizes."""
+    """The head supports encoders of other patch sizes."""
     tokens = _tokens(2, 2, *grid, patch_size=patch_size)
     raw = _head()(tokens)
     assert raw.shape == (4, 3, patch_size * grid[0], patch_size * grid[1])
@@ -37,7 +37,7 @@ def test_any_patch_size_and_grid(patch_size, grid):
 
 
 def test_tokens_that_were_not_kept_are_blank():
-    """Missing tokens must be 0, not the bias of a projection."""
+    """Missing tokens are 0, not the bias of a projection."""
     head = _head()
     tokens = _tokens(h=4, w=4)
     kept = torch.ones(32, dtype=torch.bool)
@@ -48,7 +48,7 @@ def test_tokens_that_were_not_kept_are_blank():
     head.resize_layers[2] = hook
     for given in (tokens, tokens.select(kept)):
         assert head(given).isfinite().all()
-    # Without the position embeddings, which are those of an empty map.
+    # Remove the position embeddings, which are those added to a map of zeros.
     positions = add_positions_(torch.zeros_like(seen[0]), 1.0)
     full, fewer = ((maps - positions).permute(0, 2, 3, 1).reshape(32, -1) for maps in seen)
     assert torch.equal((fewer.abs() < 1e-6).all(1), ~kept)
@@ -57,7 +57,7 @@ def test_tokens_that_were_not_kept_are_blank():
 
 @pytest.mark.parametrize("rectified", [True, False])
 def test_residual_unit_rectifies_its_skip(rectified):
-    """Published weights expect a rectified skip, and the input must stay unchanged."""
+    """Published weights expect a rectified skip, and the input is not overwritten."""
     block = ResidualUnit(8, rectified)
     nn.init.zeros_(block.conv2.weight)
     nn.init.zeros_(block.conv2.bias)
@@ -69,8 +69,7 @@ def test_residual_unit_rectifies_its_skip(rectified):
 
 @pytest.mark.parametrize("rectified", [True, False])
 def test_what_a_rectified_skip_lets_die_lives_without(rectified):
-    """Where a sum of levels is negative, tokens must still reach the result,
-    and gradients the tokens."""
+    """Where a sum of levels is negative, tokens still affect the result and get gradients."""
     head = _head(rectified_skip=rectified)
     for level in (1, 2, 3):
         nn.init.constant_(getattr(head.scratch, f"refinenet{level + 1}").out_conv.bias, -100.0)
@@ -81,7 +80,7 @@ def test_what_a_rectified_skip_lets_die_lives_without(rectified):
 
 
 def test_pointwise_is_the_convolution():
-    """The fast 1x1 convolution must equal the convolution in any memory layout."""
+    """The fast 1x1 convolution equals the convolution in any memory layout."""
     conv = nn.Conv2d(6, 4, 1)
     for layout in (torch.contiguous_format, torch.channels_last):
         x = torch.randn(2, 6, 5, 3).contiguous(memory_format=layout)
@@ -89,7 +88,7 @@ def test_pointwise_is_the_convolution():
 
 
 def test_a_guide_keeps_images_apart_and_is_local():
-    """A guide must act on its own image, near its pixel, and add tensors only where it is used."""
+    """A guide affects its own image, near its pixel, and adds parameters only if it is used."""
     head = _head(guide_channels=4)
     tokens = _tokens(b=1, v=2, h=2, w=3)
     guide = torch.rand(2, 3, 28, 42), torch.rand(2, 1, 28, 42)
@@ -105,7 +104,7 @@ def test_a_guide_keeps_images_apart_and_is_local():
 
 
 def test_last_projection_is_wide_under_autocast():
-    """Half precision in the last projection would cost centimetres."""
+    """Half precision in the last layer would cost centimetres."""
     head = _head(features=32)
     tokens = _tokens(v=2, h=5, w=5)
     with torch.no_grad():
@@ -117,7 +116,7 @@ def test_last_projection_is_wide_under_autocast():
 
 
 def test_float16_overflows_no_dense_head():
-    """Maps of a head whose weights have grown exceed 65 504; in float16 every depth was lost."""
+    """Regression: maps of a head with large weights exceed 65 504, and float16 lost every depth."""
     head, tokens = _head(features=32), _tokens(v=2, h=5, w=5)
     with torch.no_grad():
         for name, parameter in head.named_parameters():
@@ -134,8 +133,8 @@ def test_float16_overflows_no_dense_head():
 
 @pytest.mark.parametrize("grid", [(1, 1), (3, 1), (2, 2)])
 def test_gradients_under_autocast_hold_no_memory_that_was_not_written(grid):
-    """PyTorch's stride of 2 leaves parts of a gradient unset for maps one cell wide:
-    NaN of freed memory."""
+    """PyTorch's stride of 2 leaves parts of a gradient unset for maps one cell wide: NaN from freed
+    memory."""
     head, tokens = _head(out_channels=(4, 8, 8, 32)), _tokens(3, 2, *grid)
     parameters = list(head.parameters())
     for _ in range(10):
@@ -149,7 +148,7 @@ def test_gradients_under_autocast_hold_no_memory_that_was_not_written(grid):
 
 
 def test_gradients_reach_every_layer_and_agree_with_finite_differences():
-    """In-place operations must not corrupt a gradient."""
+    """In-place operations do not corrupt gradients."""
     head = _head().double()
     tokens = _tokens(v=1, h=2, w=2, patch_size=8, dtype=torch.float64)
 
@@ -163,7 +162,7 @@ def test_gradients_reach_every_layer_and_agree_with_finite_differences():
 
 
 def test_positions_made_for_inference_serve_training():
-    """Cached waves of an inference pass must not be inference tensors, which training refuses."""
+    """Cached waves must not be inference tensors, which training rejects."""
     head = _head()
     tokens = _tokens(h=5, w=7)
     with torch.inference_mode():
@@ -175,7 +174,7 @@ def test_positions_made_for_inference_serve_training():
 
 
 def test_unit_of_zero_is_zero_with_a_finite_gradient():
-    """Normalising 0 must not give NaN, forward or backward."""
+    """Normalising 0 gives no NaN, forward or backward."""
     x = torch.tensor([[0.0, 0, 0], [3, 0, 4]], requires_grad=True)
     y = unit(x)
     torch.testing.assert_close(y.detach(), torch.tensor([[0.0, 0, 0], [0.6, 0, 0.8]]))
@@ -184,7 +183,7 @@ def test_unit_of_zero_is_zero_with_a_finite_gradient():
 
 
 def test_wrong_number_of_layers_is_refused():
-    """An encoder that reads out other layers must be refused by name."""
+    """An encoder with another number of layers is rejected by name."""
     tokens = _tokens()
     with pytest.raises(InputError, match=r"tokens.latent: expected four layers; found 3"):
         _head()(dataclasses.replace(tokens, latent=tokens.latent[:3]))

@@ -1,4 +1,4 @@
-"""Gaussians: attributes, their bounds and their start."""
+"""Gaussians: attributes, their bounds and initial values."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ def run(head, batch, masks=None, pixels="subject"):
 
 
 def shake(head, scale=1.0):
-    """Leave the initial state, as training does."""
+    """Perturb the initial weights, as training does."""
     for name in HEADERS:
         torch.nn.init.normal_(getattr(head, name)[-1].weight, std=scale)
     return head
@@ -42,7 +42,7 @@ def shake(head, scale=1.0):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_attributes_match_the_release(dtype):
-    """Attributes of the authors' checkpoints must be those of their code."""
+    """Attributes of the authors' checkpoints equal those of their code."""
     head = make_head(parameterization="release").to(dtype)
     state = fixture("attribute_heads", "state", dtype)
     missing, unexpected = head.load_state_dict(state, strict=False)
@@ -58,7 +58,7 @@ def test_attributes_match_the_release(dtype):
 
 
 def test_training_starts_with_small_opaque_splats_on_the_surface():
-    """A start off the surface or transparent has no useful gradient."""
+    """Splats that are initially off the surface or transparent get no useful gradient."""
     batch = make_batch(2, 3)
     gaussians = run(make_head(), batch)
     maps = DepthMaps(batch.depths, batch.masks, batch.depths)
@@ -72,7 +72,7 @@ def test_training_starts_with_small_opaque_splats_on_the_surface():
 
 
 def test_training_starts_with_discs_that_end_at_the_silhouette():
-    """With axes of the surface: flat along the normal, wide along the surface, moved inward."""
+    """With surface axes: flat along the normal, wide along the surface, moved inward."""
     batch = make_batch(1, 3, 112, 112)
     start = {"scale_start": 0.5, "thickness_start": 0.2, "inward": 0.4}
     gaussians = run(make_head(axes="surface", attributes=start), batch)
@@ -89,7 +89,7 @@ def test_training_starts_with_discs_that_end_at_the_silhouette():
 
 
 def test_offsets_and_rotations_are_along_the_axes_of_the_surface():
-    """The same raw values from every camera of a ring mean the same, whatever the world's axes."""
+    """Equal raw values have the same effect for every camera of a ring, whatever the world's axes."""
     batch = make_batch(1, 2, 56, 56, spread=180.0)
     maps = DepthMaps(batch.depths, batch.masks, batch.depths)
     points = Unprojection()(maps, make_tokens(batch), batch)
@@ -109,7 +109,7 @@ def test_offsets_and_rotations_are_along_the_axes_of_the_surface():
 
 
 def test_rim_pixels_have_the_subjects_color_and_the_opacity_of_their_share():
-    """A photograph on black is premultiplied by its matte."""
+    """An image on black is premultiplied by its matte."""
     batch = make_batch(1, 2)
     share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(5)) * batch.masks
     mixed = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
@@ -121,7 +121,7 @@ def test_rim_pixels_have_the_subjects_color_and_the_opacity_of_their_share():
 
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_attributes_stay_within_their_bounds(scale):
-    """No raw value may give a giant, transparent or distant splat."""
+    """No raw value gives a giant, transparent or distant splat."""
     batch = make_batch()
     gaussians = run(shake(make_head(), scale), batch)
     start = run(make_head(), batch)
@@ -144,7 +144,7 @@ def test_scale_does_not_pull_on_the_depth():
 
 @pytest.mark.parametrize("parameterization", ["footprint", "release"])
 def test_no_valid_pixel_gives_no_gaussians(parameterization):
-    """A batch without a valid pixel must give an empty result with finite gradients."""
+    """A batch without a valid pixel gives an empty result with finite gradients."""
     batch = make_batch(2, 2)
     head = make_head(parameterization=parameterization)
     gaussians = run(head, batch, torch.zeros_like(batch.masks))
@@ -181,13 +181,13 @@ def test_attributes_are_wide_under_autocast():
     ],
 )
 def test_impossible_options_are_refused(options, key):
-    """A bad value is found when the configuration is read, by its key."""
+    """An invalid value is rejected when the configuration is read, by key."""
     with pytest.raises(InputError, match=key):
         make_head(**options)
 
 
 def test_the_last_projection_is_wide_under_autocast():
-    """Half precision in the last projection would round offsets of millimetres."""
+    """Half precision in the last layer would round offsets of millimetres."""
     head = shake(make_head())
     descriptors = torch.rand(50, 32)
     hidden = head.offset_header[:-1]
@@ -199,7 +199,7 @@ def test_the_last_projection_is_wide_under_autocast():
 
 
 def test_footprints_are_of_the_mean_focal_length():
-    """Pixels that are not square: the geometric mean of their sides."""
+    """For pixels that are not square, the geometric mean of their sides."""
     batch = make_batch()
     lenses = batch.cameras.intrinsics.clone()
     lenses[..., 0, 0] *= 4

@@ -1,4 +1,4 @@
-"""Guides: what dense heads and the encoder see of shapes beside tokens."""
+"""Guides: full-resolution inputs of dense heads and of the encoder."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def make_encoder(**options):
 
 
 def test_relative_maps_know_shape_and_not_distance():
-    """Moving the subject away from the camera must not change what the network sees."""
+    """Moving the subject away from the camera does not change the network's input."""
     batch = make_batch(2, 3)
     bounds = VisualHull()(batch)
     near, far = bounds.near, bounds.far
@@ -39,7 +39,7 @@ def test_relative_maps_know_shape_and_not_distance():
 
 
 def test_relative_depth_has_no_gradient_and_no_mean():
-    """The Gaussian head must not train the depth through its guide."""
+    """The Gaussian head does not train depth through its guide."""
     depth = make_batch().depths.requires_grad_()
     masks = depth > 0
     maps = relative_depth(depth, masks)
@@ -48,7 +48,7 @@ def test_relative_depth_has_no_gradient_and_no_mean():
 
 
 def test_an_empty_mask_gives_empty_maps():
-    """A view without the subject must give 0, not NaN."""
+    """A view without the subject gives 0, not NaN."""
     masks = torch.zeros(1, 2, 8, 8, dtype=torch.bool)
     depth = torch.rand(1, 2, 8, 8)
     assert not relative_depth(depth, masks).any()
@@ -57,7 +57,7 @@ def test_an_empty_mask_gives_empty_maps():
 
 @pytest.mark.parametrize("size", [(28, 42), (35, 21)])
 def test_pyramid_halves_twice(size):
-    """Odd image sides must give maps of the expected sizes."""
+    """Odd image sides give maps of the expected sizes."""
     sizes = [size, tuple((n + 1) // 2 for n in size), tuple((n + 3) // 4 for n in size)]
     full, half, quarter = GuidePyramid(6, 16)((torch.rand(2, 6, *size),), tuple(map(Window.whole, sizes)))
     assert full.shape == (2, 8, *sizes[0])
@@ -66,8 +66,7 @@ def test_pyramid_halves_twice(size):
 
 
 def test_depth_follows_the_guide():
-    """Two batches with the same tokens and other pixels give other depths,
-    but for an unguided head."""
+    """Two batches with the same tokens and different pixels give different depths, except without a guide."""
     batch = make_batch()
     other = dataclasses.replace(batch, images=batch.images.flip(-1))
     tokens = make_encoder()(batch.images, batch.masks)
@@ -82,7 +81,7 @@ def test_depth_follows_the_guide():
 
 
 def test_the_encoder_sees_bounds_where_it_is_told_to():
-    """encoder.bounds_input must reach the tokens."""
+    """Tokens depend on bounds with encoder.bounds_input."""
     batch = make_batch()
     bounds = VisualHull()(batch)
     encoder = make_encoder(mask_input=True, bounds_input=True)
@@ -93,7 +92,7 @@ def test_the_encoder_sees_bounds_where_it_is_told_to():
 
 
 def test_the_guide_shows_mattes_where_there_are_some():
-    """Masks would draw the edges that mattes are there to soften."""
+    """Masks would bring back the hard edges that mattes soften."""
     batch = make_batch()
     share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(3))
     assert torch.equal(photo_guide(batch)[1][:, 0], batch.masks.flatten(0, 1).float())

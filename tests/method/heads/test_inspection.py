@@ -1,4 +1,4 @@
-"""Offsets at their limit, counted again in the predictions."""
+"""The fraction of offsets at their limit, recounted in predictions."""
 
 import math
 
@@ -30,7 +30,7 @@ def saturating(batch, *overrides):
 
 
 def test_the_share_is_that_of_the_gaussians_of_the_prediction():
-    """They are drawn where the offset has moved them, in the axes of the world."""
+    """Offsets are recovered from the predicted positions, in world axes."""
     batch = make_batch(2, 3)
     model = saturating(batch, "model=paper", "model.frame=world")
     with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
@@ -39,7 +39,7 @@ def test_the_share_is_that_of_the_gaussians_of_the_prediction():
     points = prediction.points.pixels.flatten(0, 1).flatten(1, 2)[gaussians.image, gaussians.pixel]
     moved = (gaussians.means.double() - points.double()).abs()
     assert moved.max() <= LIMIT * 1.001
-    # Float32 keeps a position of some metres to a micrometre, of 47.5 mm.
+    # Float32 resolves positions of some metres to a micrometre, of 47.5 mm.
     sure = ((moved - 0.95 * LIMIT).abs() > 1e-5).all(-1)
     expected = (moved > 0.95 * LIMIT).any(-1)[sure].double().mean()
     assert 0.05 < expected < 0.95
@@ -50,9 +50,9 @@ def test_the_share_is_that_of_the_gaussians_of_the_prediction():
 
 
 def test_rounds_are_seen_one_after_another():
-    """The prediction is of the last ones, which the rounds have changed."""
+    """The last raw attributes, which the rounds have changed, are those of the prediction."""
     model, batch = make_model("model=recurrent").eval(), make_batch(1, 3)
-    for parameter in model.rounds.parameters():  # rounds that have learned nothing change nothing
+    for parameter in model.rounds.parameters():  # untrained rounds change nothing
         parameter.data.add_(0.01)
     with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
         prediction = predict(model, batch)
@@ -63,7 +63,7 @@ def test_rounds_are_seen_one_after_another():
 
 @pytest.mark.parametrize("limit", [LIMIT, None])
 def test_validation_logs_it_where_there_is_a_limit(limit, tmp_path):
-    """No number says that offsets without a limit are at it."""
+    """Without a limit, nothing is logged."""
     batches = [example_batch(1, size=28), example_batch(1, size=28, seed=1)]
     model = saturating(
         batches[0], "model=paper", f"gaussian_head.offset_limit={'null' if limit is None else limit}"

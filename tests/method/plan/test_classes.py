@@ -1,4 +1,4 @@
-"""Numbers of rows rounded up to size classes, as on a GPU, change nothing beyond rounding."""
+"""Numbers of rows rounded up to shape buckets, as on a GPU, change results only by rounding."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import hard_subjects, make_batch, stack, training_batch
 
-#: A share of the tokens as neighbours: their number differs between the elements of a batch.
+#: With a fraction of the tokens as neighbours, their number differs between elements of a batch.
 KINDS = [("model=paper",), ("model=hull", "recalibration.k=0.3"), ("model=recurrent", "recalibration.k=0.3")]
 TWO_ROUNDS = ["rounds.training_counts=[2]"]
 PRESETS = ["none", "exact", "balanced", "fast"]
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture
 def rounding(monkeypatch):
-    """Turns size classes on and off."""
+    """Turns shape buckets on and off."""
 
     def switched(on):
         monkeypatch.setattr(plan, "rounds_up", lambda device: on)
@@ -32,7 +32,7 @@ def rounding(monkeypatch):
 
 
 def test_size_classes_add_an_eighth_at_most_and_are_few():
-    """Each holds its count; of 100,000 counts there are about eight in an octave."""
+    """Every bucket holds its count; of 100,000 counts there are about eight per octave."""
     classes = [bucket_size(count) for count in range(1, 100_001)]
     assert all(count <= size <= count * 9 / 8 for count, size in enumerate(classes, start=1))
     assert len(set(classes)) == 117
@@ -40,7 +40,7 @@ def test_size_classes_add_an_eighth_at_most_and_are_few():
 
 
 def test_filled_rows_repeat_a_row_that_counts():
-    """Against a loop; a group without any has the first of its pixels."""
+    """Against a loop; a group without valid rows repeats its first pixel."""
     wanted = torch.rand(4, 50, generator=torch.Generator().manual_seed(0)) < 0.4
     wanted[2] = False
     size = bucket_size(int(wanted.sum(1).max()))
@@ -57,7 +57,7 @@ def test_filled_rows_repeat_a_row_that_counts():
 
 
 def test_shapes_repeat_where_subjects_differ_a_little():
-    """Of photographs of another instant: a recorded graph needs the same shapes."""
+    """Images of another instant have the same shapes, as a captured graph requires."""
     masks = make_batch(2, 3, 112, 112).masks
     other = masks & (torch.rand(masks.shape, generator=torch.Generator().manual_seed(0)) < 0.995)
     counted = [make_plan(each, 14, kept_of(each), in_buckets=False) for each in (masks, other)]
@@ -79,7 +79,7 @@ def kept_of(masks):
 @pytest.mark.parametrize("skip", PRESETS)
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0])
 def test_predictions_are_the_same(kind, skip, rounding):
-    """Of subjects of very different sizes, one of them a single pixel, in one batch."""
+    """For subjects of very different sizes in one batch, one of them a single pixel."""
     model, batch = make_model(*kind, f"skip={skip}").eval(), stack(list(hard_subjects().values()))
     rounding(False)
     expected = predict(model, batch)
@@ -96,7 +96,7 @@ def test_predictions_are_the_same(kind, skip, rounding):
 
 @pytest.mark.parametrize("kind", [*KINDS, ("model=hull", "skip=fast")], ids=str)
 def test_gradients_are_the_same(kind, rounding):
-    """A row that is repeated must not be learned from twice."""
+    """A repeated row must not be counted twice."""
     model, batch, found = (
         make_model(*kind, *TWO_ROUNDS * ("model=recurrent" in kind)).train(),
         training_batch(2, 56),
@@ -120,7 +120,7 @@ def test_gradients_are_the_same(kind, rounding):
 
 @torch.no_grad()
 def test_a_pixel_without_a_finite_depth_is_transparent(rounding):
-    """A CPU leaves it out; where sizes are known beforehand its Gaussian has opacity 0."""
+    """A CPU drops it; with fixed sizes its Gaussian has opacity 0."""
     model, batch = make_model("model=hull").eval(), stack(list(hard_subjects().values())[:2])
     head = model.depth_head.forward
 

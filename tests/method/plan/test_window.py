@@ -1,4 +1,4 @@
-"""Windows: dense heads compute a part of their result as if they computed all of it."""
+"""Windows: dense heads compute a part of their output with the values of the whole."""
 
 import itertools
 
@@ -20,7 +20,7 @@ def random_spans(full, count, seed):
 
 
 def head_of(guided, seed):
-    """A head in float64, with weights that reach as far as they can and do not fade away."""
+    """A head in float64, with weights that fill their receptive fields and do not fade away."""
     head = _head(seed, guide_channels=3 if guided else 0).double()
     for parameter in head.parameters():
         torch.nn.init.normal_(parameter, std=2 * parameter[0].numel() ** -0.5)
@@ -31,8 +31,7 @@ def head_of(guided, seed):
 @pytest.mark.parametrize("grid", [(14, 17), (21, 9)])
 @torch.no_grad()
 def test_a_window_has_the_values_of_the_whole(grid, guided):
-    """Positions, interpolation and zero padding must be those of the whole photograph,
-    to rounding."""
+    """Positions, interpolation and zero padding are those of the whole image, up to rounding."""
     patch = 6 if guided else 14
     size = (patch * grid[0], patch * grid[1])
     tokens = _tokens(1, 1, *grid, patch_size=patch, dtype=torch.float64)
@@ -56,8 +55,7 @@ def test_a_window_has_the_values_of_the_whole(grid, guided):
     ("source", "target"), [((7, 9), (14, 18)), ((14, 18), (27, 35)), ((8, 1), (3, 5)), ((5, 6), (5, 6))]
 )
 def test_a_window_is_interpolated_as_the_whole(source, target):
-    """Resizing a part gives that part of the resized whole,
-    from the cells that it names and no others."""
+    """Resizing a part gives that part of the resized whole, from only the cells in ``sources``."""
     for dtype in (torch.float32, torch.float64, torch.bfloat16):
         maps = torch.randn(2, 3, *source).to(dtype)
         whole = F.interpolate(maps, target, mode="bilinear", align_corners=True)
@@ -71,7 +69,7 @@ def test_a_window_is_interpolated_as_the_whole(source, target):
 
 
 def test_gradients_through_a_window_are_those_through_the_whole():
-    """Training on windows must be the same training."""
+    """Training on windows is the same as on whole maps."""
     tokens = _tokens(1, 2, 12, 9, dtype=torch.float64)
     window = Window(Span(30, 50, 168), Span(90, 101, 126))
     gradients = []
@@ -97,7 +95,7 @@ def test_what_was_resized_in_inference_mode_is_resized_with_a_gradient():
 
 
 def test_a_small_window_needs_little_of_the_fine_levels():
-    """What is not needed must not be computed: the finest level is a quarter of the work."""
+    """Unneeded parts are not computed: the finest level is a quarter of the work."""
     windows = _head().windows(Window(Span(210, 290, 518), Span(210, 290, 518)), (37, 37))
     assert windows.full == Window(Span(209, 291, 518), Span(209, 291, 518))
     rows = windows.levels[0].level.rows
@@ -129,8 +127,7 @@ def _windows(masks):
 @pytest.mark.parametrize("name", list(CASES))
 @torch.no_grad()
 def test_every_wanted_pixel_is_decoded_as_in_the_whole(name, largest, monkeypatch):
-    """Images one by one or in one window: each wanted pixel is in a part,
-    with the value of the whole map."""
+    """Images one by one or in one window: each wanted pixel is in a part, with the value of the whole map."""
     monkeypatch.setattr(dense, "_LARGEST", largest)
     masks, tokens = CASES[name], _tokens(1, 3, 5, 4)
     head = _head()
@@ -149,7 +146,7 @@ def test_every_wanted_pixel_is_decoded_as_in_the_whole(name, largest, monkeypatc
 
 
 def test_a_gradient_of_zero_flows_where_nothing_is_wanted():
-    """A part of the batch without a valid pixel must not leave parameters without a gradient."""
+    """Without a valid pixel, parameters still get a gradient of 0."""
     head = _head()
     (part,) = decode(head, _tokens(1, 2, 3, 3), None, [None, None])
     part.maps[:0].sum().backward()
@@ -157,7 +154,7 @@ def test_a_gradient_of_zero_flows_where_nothing_is_wanted():
 
 
 def test_windows_hold_the_subject_and_no_more():
-    """The first and last row and column of each mask; nothing for an empty one."""
+    """From the first to the last row and column of each mask; None for an empty one."""
     found = _windows(CASES["two_people"])
     assert found[0] == Window(Span(5, 66, 70), Span(3, 52, 56))
     assert found[2] is None
@@ -177,7 +174,7 @@ def test_a_widened_span_stays_within_its_map(full):
 @pytest.mark.parametrize("guided", [False, True], ids=["tokens", "guide"])
 @torch.no_grad()
 def test_rows_one_after_another_are_the_rows_at_once(guided, monkeypatch):
-    """The largest maps are held in part, which must not be seen in the result."""
+    """Computing the largest maps in parts does not change the result."""
     patch, grid = (6, (9, 7)) if guided else (14, (4, 3))
     size = (patch * grid[0], patch * grid[1])
     tokens = _tokens(1, 2, *grid, patch_size=patch, dtype=torch.float64)

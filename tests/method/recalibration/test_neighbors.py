@@ -1,4 +1,4 @@
-"""Neighbours against their definition: ties, few points, points of all sizes."""
+"""Neighbours against their definition: ties, few points, points of all magnitudes."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from tests.helpers.tokens import literal_neighbors, make_stage, scene
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("k", [1, 2, 3, 7, 64])
 def test_neighbors_are_those_of_the_definition(k, dtype):
-    """From all views, the point itself among them; all of them where there are fewer."""
+    """Neighbours come from all views and include the point itself; if there are fewer, all are neighbours."""
     for count in (1, 2, 9, 43):
         points = torch.rand(count, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
         for moved in (points, points + 1000.0):  # far from the origin, too
@@ -25,8 +25,8 @@ def test_neighbors_are_those_of_the_definition(k, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_ties_on_the_image_plane_favor_no_view_and_no_side(dtype):
-    """Views share their places there, so most distances are equal;
-    lower views had a quarter more."""
+    """Regression: views share positions there, so most distances are equal; views with lower indices had
+    a quarter more neighbours."""
     tokens, points = scene(((144, 144, 144, 144),), grid=(12, 12))
     module = make_stage(neighborhood="image_plane", k=48)
     position = module.positions(tokens, points).to(dtype)
@@ -49,7 +49,7 @@ def test_ties_on_the_image_plane_favor_no_view_and_no_side(dtype):
 
 
 def test_neighbors_on_the_image_plane_are_those_of_whole_photographs():
-    """Patches that left must not move the others: the ablation would align the views."""
+    """Dropped patches do not shift the others: the ablation would otherwise align the views."""
     tokens, points = scene(((16, 16, 16),))
     module = make_stage(neighborhood="image_plane", k=5)
     left = tokens.image == 1
@@ -80,7 +80,7 @@ def test_blocks_do_not_change_the_neighbors(monkeypatch):
 
 
 def test_fewer_points_than_k_and_none():
-    """Fewer points than ``k``, and elements without points, do not fail or give NaN."""
+    """Fewer points than ``k``, and elements without points, neither fail nor give NaN."""
     assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).shape[0] == 0
     for counts in (((0, 0, 0), (3, 0, 0)), ((0, 0, 0), (0, 0, 0))):
         tokens, points = scene(counts)
@@ -89,7 +89,7 @@ def test_fewer_points_than_k_and_none():
 
 
 def test_points_of_all_sizes_have_neighbors():
-    """Huge, tiny and broken points give valid indices, and broken points are never near."""
+    """Huge, tiny and broken points give valid indices, and broken points are never neighbours."""
     points = torch.rand(40, 3) * torch.logspace(-20, 25, 40)[:, None]
     points[7], points[8] = float("nan"), float("inf")
     found = nearest_neighbors(points, torch.zeros(40, dtype=torch.int64), 8)
@@ -99,7 +99,7 @@ def test_points_of_all_sizes_have_neighbors():
 
 
 def test_at_each_place_of_the_image_plane_the_own_view_comes_first():
-    """One more neighbour than there are views: it is of the query's own view, whichever that is."""
+    """With one more neighbour than views, the additional one is from the query's own view."""
     tokens, points = scene(((16, 16, 16, 16),))
     module = make_stage(neighborhood="image_plane", k=5)
     places, views = module.places(tokens), tokens.grid[1]

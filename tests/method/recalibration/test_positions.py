@@ -1,4 +1,4 @@
-"""Relative positions in the values of attention (``recalibration.positions=relative``)."""
+"""Relative positions in the attention values (``recalibration.positions=relative``)."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from tests.helpers.tokens import literal_attention, make_stage, scene
 
 
 def relative_stage(**options):
-    """A stage in float64 whose values know of places, as after some training."""
+    """A stage in float64 whose values depend on positions, as after some training."""
     stage = make_stage(positions="relative", **options).double()
     torch.nn.init.normal_(stage.block.place_proj.weight)
     return stage
@@ -29,7 +29,7 @@ def at(points, places):
 
 
 def test_a_neighbour_says_where_it_lies():
-    """Against a loop over queries, heads and neighbours."""
+    """Values with positions equal loops over queries, heads and neighbours."""
     tokens, points = scene()
     tokens = double(tokens)
     points = at(points, points.tokens.double())
@@ -44,7 +44,7 @@ def test_a_neighbour_says_where_it_lies():
 
 
 def test_training_starts_as_without():
-    """The map of places starts at 0, and learns from the first step on."""
+    """The map of positions is 0 initially, and learns from the first step on."""
     tokens, points = scene()
     off = make_stage()
     on = make_stage(positions="relative")
@@ -58,7 +58,7 @@ def test_training_starts_as_without():
 
 @pytest.mark.parametrize("scores", [1 << 26, 0], ids=["product", "gathered"])
 def test_the_gradient_is_that_of_finite_differences(scores, monkeypatch):
-    """With respect to tokens, places and their map."""
+    """With respect to tokens, positions and their map."""
     monkeypatch.setattr("ghgs_lit.ops.neighbors._SCORES", scores)
     torch.manual_seed(0)
     block = SemanticAttention(16, 2, has_places=True).double()
@@ -77,7 +77,7 @@ def test_the_gradient_is_that_of_finite_differences(scores, monkeypatch):
 
 @pytest.mark.parametrize("options", [{}, {"k": 0.3}], ids=["number", "share"])
 def test_rows_that_fill_up_a_size_class_say_nothing(options):
-    """As on a GPU, where elements have equally many rows; one point is not finite."""
+    """Padding of a shape bucket, as on a GPU, has no effect; one point is not finite."""
     tokens, points = scene(((16, 9, 3), (6, 2, 5)))
     tokens = double(tokens)
     places = points.tokens.double()
@@ -93,7 +93,7 @@ def test_rows_that_fill_up_a_size_class_say_nothing(options):
 
 
 def test_places_are_in_units_of_the_subject():
-    """Background tokens, which take part with tokens=all, change neither middle nor unit."""
+    """Background tokens, which are recalibrated with tokens=all, change neither centre nor unit."""
     points = torch.tensor([[1.0, 0.0, 0.0], [3.0, 0.0, 0.0], [50.0, 0.0, 0.0], [torch.inf, 0.0, 0.0]])
     found = places_around(points, torch.tensor([True, True, False, True]))
     assert found[:, 0].tolist() == [-1.0, 1.0, 48.0, 0.0]
@@ -102,7 +102,7 @@ def test_places_are_in_units_of_the_subject():
 
 
 def test_half_precision_keeps_places_exact():
-    """What places add is computed in float32 under autocast."""
+    """The contribution of positions is computed in float32 under autocast."""
     tokens, points = scene()
     stage = make_stage(positions="relative")
     torch.nn.init.normal_(stage.block.place_proj.weight)

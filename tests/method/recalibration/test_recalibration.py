@@ -1,4 +1,4 @@
-"""The recalibration stage: attention against the equations and the release, options."""
+"""The recalibration stage: attention against the equations and the release, and its options."""
 
 import dataclasses
 from typing import get_args
@@ -78,7 +78,7 @@ def test_other_tokens_pass_unchanged_and_all_takes_them_in():
 
 
 def test_a_share_of_the_tokens_is_a_number_for_each_element():
-    """A tenth of 40 and of 25 tokens; one at least. A number means the same whatever the size."""
+    """A tenth of 40 and of 25 tokens, at least one; an integer is independent of the number of tokens."""
     assert [neighbor_count(0.1, count) for count in (40, 25, 3, 0)] == [4, 2, 1, 1]
     assert [neighbor_count(64, count) for count in (40, 1000)] == [64, 64]
     assert RecalibrationOptions(k=0.1).k == 0.1
@@ -110,7 +110,7 @@ def test_neighborhoods():
 
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_gradients_are_finite_where_points_coincide(similarity):
-    """Coincident points and zero features give finite gradients, and none reach the points."""
+    """Coincident points and zero features give finite gradients, and points get none."""
     tokens, points = scene()
     points = dataclasses.replace(points, tokens=torch.zeros_like(points.tokens).requires_grad_())
     tokens = dataclasses.replace(
@@ -136,7 +136,7 @@ def test_dissimilar_neighbors_lose_their_weight_in_log_only():
 
 
 def test_blocks_of_queries_change_nothing(monkeypatch):
-    """Computing a part of the tokens at a time gives the same result."""
+    """Computing tokens in parts gives the same result."""
     tokens, points = scene()
     module = make_stage()
     expected = module(tokens, points)
@@ -169,15 +169,15 @@ def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
     ],
 )
 def test_impossible_options_are_refused(options, key):
-    """Impossible options are refused with their key."""
+    """Impossible options are rejected by key."""
     with pytest.raises(InputError, match=key):
         make_stage(**options)
 
 
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, monkeypatch):
-    """The path of a GPU and of many tokens, in one part and in several,
-    computed again for the gradient."""
+    """The path for a GPU and for many tokens, in one part and in several with recomputation in the
+    backward pass."""
     torch.manual_seed(0)
     block = SemanticAttention(64, 2, similarity).double()
     inputs = [torch.randn(40, 16, dtype=torch.float64, requires_grad=True) for _ in range(3)]
@@ -202,7 +202,7 @@ def test_neighbors_that_the_ablation_keeps_are_counted(neighborhood):
     tokens, points = scene()
     with seen_calls(stage_of := make_stage(k=5, neighborhood=neighborhood)) as calls:
         stage_of(tokens, points)
-    stage_of(tokens, points)  # no longer seen
+    stage_of(tokens, points)  # outside the context: not collected
     (call,) = calls
     seen = neighborhoods(*call)
     assert [one.tokens for one in seen] == [12, 13]

@@ -1,4 +1,4 @@
-"""Coarse to fine: which photographs have smaller copies, and how their depths start the rounds."""
+"""Coarse to fine: which views are downsampled, and how the resulting depths initialise the rounds."""
 
 import dataclasses
 
@@ -19,13 +19,13 @@ from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
 from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import in_dtype, make_batch, with_soft_rims
 
-#: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
+#: of images that are too large for weights trained for a subject of ``HEIGHT`` pixels
 SIDE = 112
 HEIGHT = 40
 
 
 def recurrent(height, *overrides):
-    """A model with rounds that change something, which knows subjects of ``height`` pixels."""
+    """A model trained for subjects of ``height`` pixels, with rounds that change something."""
     small = ("rounds.hidden=16", "rounds.depths=4", f"rounds.height={height}")
     model = make_model("model=recurrent", "skip=exact", *small, *overrides).eval()
     torch.nn.init.normal_(model.rounds.change[-1].weight, std=0.5)
@@ -33,7 +33,7 @@ def recurrent(height, *overrides):
 
 
 def stacked(*batches):
-    """One batch of the elements of several, without depths."""
+    """The elements of several batches in one, without depths."""
     matrices = {
         name: torch.cat([getattr(batch.cameras, name) for batch in batches])
         for name in ("intrinsics", "extrinsics")
@@ -44,8 +44,7 @@ def stacked(*batches):
 
 
 def test_the_height_of_each_subject_decides():
-    """Its tallest view, or the widest, in the pixels of its own photographs;
-    sides are whole patches."""
+    """Its tallest or widest view in pixels decides; sides of copies are whole patches."""
     tall, small = make_batch(1, 3, SIDE, SIDE), make_batch(1, 3, SIDE, SIDE, zoom=0.3)
     pair = stacked(tall, small)
     rows = tall.masks[0].any(-1).sum(-1).max().item()
@@ -62,8 +61,7 @@ def test_the_height_of_each_subject_decides():
 
 
 def test_smaller_copies_show_the_same_scene():
-    """Points of the surface have the same place in the picture,
-    colours and shares stay where they are."""
+    """Surface points keep their position in the image, and colours and mattes stay in place."""
     batch = with_soft_rims(make_batch(1, 3, 112, 84))
     batch = dataclasses.replace(batch, images=batch.alpha[:, :, None].expand(-1, -1, 3, -1, -1) / 2)
     found = shrunk(batch, (56, 42), 0.125)
@@ -76,18 +74,18 @@ def test_smaller_copies_show_the_same_scene():
     torch.testing.assert_close(pixels[1], pixels[0] / 2)
     torch.testing.assert_close(found.images[:, :, 0], found.alpha / 2)
     assert torch.equal(found.masks, found.alpha > 0.125)
-    # Shares are means over areas: their sum is that of the pixels.
+    # Mattes are means over areas, so their sum is preserved.
     torch.testing.assert_close(4 * found.alpha.sum((2, 3)), batch.alpha.sum((2, 3)), rtol=1e-3, atol=0)
 
 
 def test_enlarged_depths_lie_on_planes_up_to_a_pixel_beyond_what_is_known():
     def plane(side):
-        """Depths of a plane, whose inverse is linear in the picture."""
+        """Depths of a plane, whose inverse is linear in the image."""
         along = (torch.arange(side, dtype=torch.float64) + 0.5) / side
         return 1 / (0.4 + 0.1 * along[:, None] + 0.05 * along).expand(1, 1, side, side)
 
     found = enlarged(DepthMaps(plane(24), plane(24) > 0, plane(24)), (60, 60))
-    # beyond the outermost centres nothing is interpolated
+    # values are not extrapolated beyond the outermost centres
     inner = (..., slice(2, -2), slice(2, -2))
     torch.testing.assert_close(found[inner], plane(60)[inner], rtol=1e-12, atol=0)
     known = torch.ones(1, 1, 24, 24, dtype=torch.bool)
@@ -111,15 +109,14 @@ def test_coarse_depths_stay_within_bounds():
 
 
 def test_tokens_of_copies_are_interpolated_where_the_patches_of_photographs_lie():
-    """Values that are linear in the picture stay so, with a border,
-    and beside tokens that are missing."""
+    """Values that are linear in the image stay linear, with padding, and next to missing tokens."""
     batch, small, patch = make_batch(1, 2, 98, 108), (56, 70), 14
     padding = pad_to_patches(batch.masks, patch)
     padded = padding.pad_batch(batch)
     rows, columns = (side // patch for side in small)
 
     def value(x, y):
-        """Of a place in shares of the photograph's sides."""
+        """Linear function of the position, in fractions of the image's sides."""
         return torch.stack((2 * x - y + 0.5, 3 * y), -1)
 
     image, row, column = torch.nonzero(torch.ones(2, rows, columns), as_tuple=True)
@@ -144,8 +141,7 @@ def test_tokens_of_copies_are_interpolated_where_the_patches_of_photographs_lie(
 
 
 def test_rounds_start_from_what_is_found_in_a_smaller_copy():
-    """Encoder and depth head see the copy alone;
-    rounds start from its final depths and its tokens."""
+    """Encoder and depth head process the copy alone; rounds start from its final depths and its tokens."""
     batch, seen, tokens = make_batch(1, 3, SIDE, SIDE), [], []
     model = recurrent(HEIGHT, "model.frame=world")  # one frame for both sizes
     model.depth_head.register_forward_hook(lambda head, inputs, maps: seen.append(inputs[1]))
@@ -186,7 +182,7 @@ def test_the_training_says_what_height_the_weights_know(trained, height, side):
         nodes["rounds"]["height"] = said
         assert with_known_height(nodes, trained) == nodes
     assert with_known_height({"model": {}}, trained) == {"model": {}}
-    # what fits into a photograph of the training is never predicted from a copy
+    # subjects that fit into an image of the training are never downsampled
     if side is not None:
         batch = make_batch(1, 2, side, side)
         filled = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
@@ -202,7 +198,7 @@ def test_the_training_says_what_height_the_weights_know(trained, height, side):
 @pytest.mark.parametrize("pad", ["none", "multiple"])
 def test_elements_with_and_without_a_copy_do_not_touch_one_another(pad):
     side = SIDE if pad == "none" else SIDE - 5
-    batches = [make_batch(1, 2, side, side, zoom=zoom) for zoom in (0.8, 0.3, 0.6)]  # not as many views
+    batches = [make_batch(1, 2, side, side, zoom=zoom) for zoom in (0.8, 0.3, 0.6)]  # fewer views
     batches = [in_dtype(dataclasses.replace(batch, depths=None), torch.float64) for batch in batches]
     model = recurrent(HEIGHT, f"model.pad={pad}").double()
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What neighbouring pixels exchange, against SciPy's correlation of whole images."""
+"""Feature exchange between neighbouring pixels, against SciPy's correlation of whole images."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
 
 
 def scene(masks):
-    """The Gaussians of some of the subject's pixels, as a skip leaves them, and their batch."""
+    """The Gaussians of some of the subject's pixels, as with a skip preset, and their batch."""
     image, row, column = torch.nonzero(masks, as_tuple=True)
     raw = SimpleNamespace(image=image, pixel=row * WIDTH + column, real=None)
     batch = SimpleNamespace(masks=masks[None], extents=extents(masks))
@@ -36,7 +36,7 @@ def trained(seed=0):
 
 
 def expected(exchange, raw, known):
-    """By definition: maps of whole images, SciPy's correlation, no windows."""
+    """The definition: maps of whole images, SciPy's correlation, no windows."""
     with torch.no_grad():
         told = exchange.tell(known).numpy()
     maps = np.zeros((3, HEIGHT * WIDTH, CHANNELS))

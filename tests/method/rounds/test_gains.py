@@ -1,4 +1,4 @@
-"""Cameras whose exposure differs: their gains are found, and divided out."""
+"""Cameras with different exposures: their gains are estimated and removed."""
 
 import dataclasses
 import math
@@ -19,13 +19,12 @@ def waves(points):
 
 
 def halves(points):
-    """A little darker before than behind."""
+    """Colours that are slightly darker in front than behind."""
     return torch.where(points[..., 2:] > CENTER[2], 0.46, 0.4).expand(points.shape)
 
 
 def painted(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
-    """A surface whose colour is a function of the place in the world,
-    so that all views agree about it."""
+    """A surface whose colour depends on the position in the world, so that all views agree."""
     batch = make_batch(batch, views, spread=spread)
     masks, depths = ellipsoid(batch.cameras, radii=radii)
     batch = dataclasses.replace(batch, masks=masks, depths=depths)
@@ -44,7 +43,7 @@ def drawn(batch, seed=0, stops=0.5):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_gains_are_found(seed):
-    """Half a stop between cameras, to 3 %; photographs that are divided by them agree again."""
+    """Half a stop between cameras is found to 3 %, and corrected images agree."""
     batch = painted(2)
     gains = drawn(batch, seed)
     dark = seen_with(batch, gains)
@@ -58,14 +57,14 @@ def test_gains_are_found(seed):
 
 
 def test_differences_below_the_error_of_the_estimate_are_left():
-    """Half a percent between cameras is as likely an error of the depths."""
+    """Half a percent between cameras may as well be an error of depths."""
     batch = painted()
     found = log_gains(surface_splats(batch), seen_with(batch, np.exp(drawn(batch, stops=0.02) - 1)))
     assert 0 < found.abs().max() < 1e-3
 
 
 def test_highlights_do_not_decide():
-    """A camera sees a third of the surface twice as dark as all others do."""
+    """In one camera, a third of the surface is twice as dark as in all others."""
     batch = painted()
     gains = drawn(batch)
     dark = seen_with(batch, gains)
@@ -77,7 +76,7 @@ def test_highlights_do_not_decide():
 
 
 def test_what_a_view_does_not_see_does_not_count():
-    """Cameras all around a surface that is a little darker before than behind."""
+    """Cameras all around a surface that is slightly darker in front than behind."""
     batch = painted(views=6, spread=360.0, paint=halves)
     gains = drawn(batch)
     dark = seen_with(batch, gains)
@@ -85,8 +84,8 @@ def test_what_a_view_does_not_see_does_not_count():
 
 
 def test_dark_rims_do_not_count():
-    """Half-covered pixels at the outline of a narrow board are darker in one view than their
-    matte says."""
+    """Half-covered pixels at the outline of a narrow board are darker in one view than their matte
+    implies."""
     sharp = painted(views=3, spread=20.0, radii=torch.tensor([0.1, 0.8, 0.01]))
     soft = with_soft_rims(sharp)
     soft = dataclasses.replace(soft, images=sharp.images * soft.alpha[:, :, None])
@@ -100,8 +99,7 @@ def test_dark_rims_do_not_count():
 
 @pytest.mark.parametrize("kind", ["white", "black"])
 def test_colours_without_a_ratio_do_not_count(kind):
-    """Clipped highlights, and shadows that lie on a sensor's black level,
-    on most of the surface."""
+    """Clipped highlights, and shadows at a sensor's black level, cover most of the surface."""
     value = {"white": 0.97, "black": 0.01}[kind]
     batch = painted(paint=lambda p: torch.where(p[..., 1:2] > 1.1, 0.4, value).expand(p.shape))
     gains = drawn(batch)
@@ -126,7 +124,7 @@ def test_batch_mates_change_nothing():
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_photographs_that_say_nothing_have_no_gains(value):
-    """Black or white all over; and no Gaussians at all."""
+    """Entirely black or white images, and no Gaussians at all."""
     batch = painted()
     flat = dataclasses.replace(batch, images=torch.full_like(batch.images, value))
     assert not log_gains(surface_splats(flat), flat).any()
@@ -135,8 +133,7 @@ def test_photographs_that_say_nothing_have_no_gains(value):
 
 
 def test_the_model_equalizes_before_its_rounds():
-    """Colours of the Gaussians are those of the equalized photographs;
-    without the option they are not."""
+    """The Gaussians' colours are those of the corrected images; without the option they are not."""
     batch = painted()
     dark = seen_with(batch, drawn(batch))
     models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]
@@ -151,7 +148,7 @@ def test_the_model_equalizes_before_its_rounds():
 
 
 def test_photographs_that_are_divided_already_are_not_equalized_again():
-    """To the bit what a model without the option predicts of them, also of some views alone."""
+    """The prediction equals, bit for bit, that of a model without the option, also for a subset of views."""
     batch = painted()
     dark, logs = seen_with(batch, drawn(batch)), torch.zeros(1, 4, 3)
     logs[0, 1], logs[0, 3] = 0.1, -2.0
@@ -175,7 +172,7 @@ def test_photographs_that_are_divided_already_are_not_equalized_again():
 @pytest.mark.parametrize("gamma", [0.8, 1.2])
 @pytest.mark.parametrize("view", range(4))
 def test_the_gamma_of_each_camera_is_found(view, gamma):
-    """In all channels, whatever its exposure; the others have none."""
+    """In all channels and at any exposure; the others have none."""
     batch = painted(2)
     gains = drawn(batch)
     images = (0.6 * batch.images * torch.as_tensor(gains)[..., None, None].float()).clone()

@@ -1,4 +1,4 @@
-"""What photographs show of Gaussians."""
+"""Samples of images and renders at the positions of Gaussians."""
 
 import dataclasses
 import math
@@ -18,20 +18,20 @@ from tests.helpers.scenes import make_batch, surface_splats, with_soft_rims
 
 @pytest.mark.parametrize("size", [(56, 56), (42, 84)])
 def test_a_gaussian_sees_itself_in_its_own_view(size):
-    """Colour equal to the photograph's, inside the mask, not hidden."""
+    """Its colour equals the image's, inside the mask and not occluded."""
     batch = make_batch(2, 3, *size)
     gaussians = surface_splats(batch)
     each = observe(gaussians, batch)
     assert each.shape == (len(gaussians), 3, CHANNELS)
     own = each[:, 0]
-    assert own[:, :3].abs().max() < 1e-3  # the photograph's colour is its own
+    assert own[:, :3].abs().max() < 1e-3  # the image's colour is its own
     assert (own[:, 6] - 1).abs().max() < 1e-3  # inside the mask
     assert (own[:, 9] == 1).all()
     assert torch.equal(each[..., 10], torch.tensor([1.0, 0, 0]).expand(len(each), 3))
 
 
 def test_what_lies_behind_the_surface_is_hidden():
-    """Against the true depths of the pixels that Gaussians fall on."""
+    """Against the true depths at the pixels that Gaussians project to."""
     batch = make_batch(1, 4)
     gaussians = surface_splats(batch)
     each = observe(gaussians, batch)[..., 8]
@@ -70,8 +70,7 @@ def test_what_is_not_finite_reaches_no_other_element():
 
 
 def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
-    """Gaussians with the subject's colours and its share as opacity;
-    the share takes the mask's place."""
+    """Gaussians have the subject's colours and the matte as opacity; the matte replaces the mask."""
     batch = with_soft_rims(make_batch(1, 2))
     plain = observe(surface_splats(batch), dataclasses.replace(batch, alpha=None))
     each = observe(surface_splats(batch), batch)
@@ -94,7 +93,7 @@ def test_errors_are_the_photograph_minus_the_render():
 
 
 def slanted(batch):
-    """Splats that do not fit: moved, of three sizes, half transparent."""
+    """Splats that do not fit: shifted, of three sizes, half transparent."""
     gaussians = surface_splats(batch)
     generator = torch.Generator().manual_seed(3)
     moved = 0.01 * torch.randn(gaussians.means.shape, generator=generator)
@@ -110,8 +109,8 @@ def slanted(batch):
 
 
 def test_slopes_say_by_how_much_the_error_changes():
-    """Against differences of the rendered error as means move along rays, scales grow,
-    colours change."""
+    """Against finite differences of the rendered error with respect to means along rays, scales,
+    opacities and colours."""
     batch = make_batch(1, 3, 28, 28)
     gaussians = slanted(batch)
     n = len(gaussians)
@@ -131,7 +130,7 @@ def test_slopes_say_by_how_much_the_error_changes():
         return (wrong + (shown.alpha - coverage(batch)[:, :, None]).double().square().sum()) / 2
 
     def rise(step, change):
-        """Of the error, over a step of 1 of what changes."""
+        """Finite difference of the error."""
         return (error(**change(step)) - error(**change(-step))) / (2 * step)
 
     logits = gaussians.opacities.logit()
@@ -144,14 +143,14 @@ def test_slopes_say_by_how_much_the_error_changes():
     torch.testing.assert_close(
         found, expected, rtol=0.1, atol=0.01 * float(expected.abs().max())
     )  # splats are cut off
-    # Slopes along a Gaussian's own axes make up that along the ray.
+    # Slopes along a Gaussian's axes add up to that along the ray.
     own = quaternion_to_matrix(gaussians.quaternions).double()
     across = (own @ steep[:, 1:4, None])[..., 0]
     torch.testing.assert_close((across * rays).sum(-1), steep[:, 0], rtol=1e-3, atol=1e-4)
 
 
 def test_slopes_of_inference_are_those_of_training():
-    """To the bit, in inference mode and for an element beside another."""
+    """Bit for bit, in inference mode and with another element in the batch."""
     batch = make_batch(2, 3, 28, 28)
     gaussians = slanted(batch)
     n = len(gaussians)
@@ -169,8 +168,8 @@ def test_slopes_of_inference_are_those_of_training():
 
 
 def test_elements_of_different_sizes_are_looked_up_as_one_by_one():
-    """Elements are padded to one number of Gaussians: what pads is in no result,
-    also beside one of none."""
+    """Elements are padded to the same number of Gaussians; the padding appears in no result, also with an
+    empty element."""
     batch = make_batch(3, 3, 42, 56)
     whole = surface_splats(batch)
     first, _, last = (whole[i] for i in range(3))

@@ -1,4 +1,4 @@
-"""Rounds: where they start, that they stay within bounds, that they learn."""
+"""Rounds: initial behaviour, bounds, and training."""
 
 import dataclasses
 import itertools
@@ -49,7 +49,7 @@ def test_untrained_rounds_change_nothing():
 
 @pytest.mark.parametrize("count", [1, 8])
 def test_more_rounds_than_trained_stay_within_bounds(count):
-    """Whatever the weights are: depths between near and far, everything finite."""
+    """For any weights, depths stay between near and far, and everything is finite."""
     batch = make_batch(1, 4)
     wild = model(kick=30.0)
     wild.rounds.count = count
@@ -67,7 +67,7 @@ def test_more_rounds_than_trained_stay_within_bounds(count):
 
 
 def test_gaussians_that_are_replaced_need_no_gradient():
-    """Training, which computes none for them, has the gradients of evaluation, which does."""
+    """Training computes no gradients for them, and has the same total gradients as evaluation, which does."""
     batch, kicked = make_batch(1, 4), model("rounds.training_counts=[2]", kick=0.1)
     learned, found = [p for p in kicked.parameters() if p.requires_grad], []
     for is_training in (False, True):
@@ -146,8 +146,8 @@ def test_what_padding_added_is_cut_off_every_round():
 
 
 def test_validation_shows_what_each_round_is_worth():
-    """PSNR and depth error before each round:
-    those of the whole model where rounds change nothing."""
+    """PSNR and depth error before each round are logged: those of the whole model if rounds change
+    nothing."""
     batch = make_batch(1, 3)
     batch = dataclasses.replace(batch, targets=Targets(batch.images, batch.masks, batch.cameras))
     trained = GHGSModule(
@@ -163,8 +163,7 @@ def test_validation_shows_what_each_round_is_worth():
 
 
 def test_each_round_changes_half_as_much_as_the_one_before():
-    """Raw attributes, and how far depths may move:
-    with the same output of the network each round."""
+    """For raw attributes and the range of depths, with the same output of the network in each round."""
     batch, recurrent = make_batch(1, 3), model("rounds.gains=false")
     recurrent.rounds.count = 3
     torch.nn.init.constant_(recurrent.rounds.change[-1].bias, 0.01)
@@ -185,7 +184,7 @@ def test_each_round_changes_half_as_much_as_the_one_before():
 
 
 def test_depths_are_compared_between_near_and_far_only(monkeypatch):
-    """However far a round may search."""
+    """For any range of the search."""
     monkeypatch.setattr("ghgs_lit.method.rounds.rounds.REACH", 1.0)
     batch, wild = make_batch(1, 4), model(kick=30.0)
     wild.rounds.count = 1
@@ -194,4 +193,4 @@ def test_depths_are_compared_between_near_and_far_only(monkeypatch):
     depth, near, far = (x[maps.valid] for x in (maps.depth, maps.bounds.near, maps.bounds.far))
     assert (depth >= near - 1e-5 * depth).all()
     assert (depth <= far + 1e-5 * depth).all()
-    assert ((depth > far - 1e-3) | (depth < near + 1e-3)).any()  # it went as far as it may
+    assert ((depth > far - 1e-3) | (depth < near + 1e-3)).any()  # some depths reach their bounds
