@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.precision import exact, has_bfloat16
-from ghgs_lit.runtime.watching import Watcher, watched
+from ghgs_lit.runtime.watching import Watcher, watch_stages
 from tests.helpers.models import ATTRIBUTES, make_model
 from tests.helpers.scenes import make_batch
 from tests.helpers.splats import relative_error
@@ -42,7 +42,7 @@ def double(batch):
 def results(predictor, batch):
     """Results of the stages for the subject by name, on the CPU."""
     seen = Results()
-    with watched(predictor.model, {name: name for name in ("encoder", "recalibration")}, seen):
+    with watch_stages(predictor.model, {name: name for name in ("encoder", "recalibration")}, seen):
         prediction = predictor(batch).to("cpu")
     bounds, masks = prediction.depth_maps.bounds, batch.masks.cpu()
     found = {

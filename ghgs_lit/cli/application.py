@@ -28,7 +28,7 @@ from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.processes import interruptible
 from ghgs_lit.runs.run import SESSIONS, WRITTEN, RunDirectory
 from ghgs_lit.runtime.allocation import collect_garbage_again
-from ghgs_lit.runtime.cores import children_sleep
+from ghgs_lit.runtime.cores import let_children_sleep
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
 read_as_ghgs()
@@ -117,7 +117,7 @@ class Verb:
             verb.require_files()
             verb.complete(plain(fill(cfg)))  # before slow imports of the verb
             collect_garbage_again()
-            children_sleep()
+            let_children_sleep()
             result = verb.run()
             if is_dry:
                 discard_unused(directory, self.name, self.started)
@@ -129,11 +129,11 @@ class Verb:
             discard_unused(Path(HydraConfig.get().runtime.output_dir), self.name, self.started)
             if self.wants_trace:
                 raise
-            print(f"ghgs {self.name}: {messages.one_line(error, self.name)}", file=sys.stderr)
+            print(f"ghgs {self.name}: {messages.format_error(error, self.name)}", file=sys.stderr)
             raise SystemExit(1) from error
 
 
-def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
+def _rewrite_overrides(verb: str, arguments: list[str]) -> list[str]:
     """Rewrite overrides for Hydra.
 
     Keys of ``data`` and ``rounds`` are forced (``++``) where these nodes come from a checkpoint, and
@@ -149,13 +149,13 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     return [re.sub(forced, "++", argument) for argument in arguments]
 
 
-def _help(verb: str, words: list[str], folder: str | None) -> int:
+def _print_help(verb: str, words: list[str], folder: str | None) -> int:
     """Print the help of the verb, or of the groups given as words without ``=``, and return the exit
     code."""
     from ghgs_lit.cli.help import print_group, print_verb
 
     groups = [word for word in words if "=" not in word]
-    overrides = _for_hydra(verb, [word for word in words if "=" in word])
+    overrides = _rewrite_overrides(verb, [word for word in words if "=" in word])
     cfg = compose(verb, overrides, with_hydra=True, folder=folder, is_filled=bool(groups))
     for group in groups:
         print_group(verb, group, cfg, folder)
@@ -203,18 +203,18 @@ def run(verb: str, argv: list[str]) -> int:
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
     task = Verb(verb, tuple(argv), wants_trace)
-    threading.excepthook = messages.print_of_thread
+    threading.excepthook = messages.print_thread_error
     try:
         with interruptible():  # around the handling of errors: an interruption may look like one
-            flags, overrides, values = messages.parsed(argv[2:])
+            flags, overrides, values = messages.parse_arguments(argv[2:])
             if values.help:
-                return _help(verb, overrides, values.config_dir)
+                return _print_help(verb, overrides, values.config_dir)
             messages.check_deletions(overrides)
             store_defaults(verb, values.config_dir)
             if values.cfg == "job":
-                _print_configuration(values.config_name or verb, _for_hydra(verb, overrides), values)
+                _print_configuration(values.config_name or verb, _rewrite_overrides(verb, overrides), values)
                 return 0
-            overrides = _for_hydra(verb, overrides)
+            overrides = _rewrite_overrides(verb, overrides)
             if values.multirun or "hydra.mode=MULTIRUN" in overrides:
                 messages.check_directory(overrides, sweeps=True)
             sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *overrides]
@@ -228,8 +228,8 @@ def run(verb: str, argv: list[str]) -> int:
         print(f"ghgs {verb}: {error}", file=sys.stderr)
         return 2
     except Exception as error:
-        if wants_trace or not (isinstance(error, messages.BAD_INPUT) or messages.raised_by_hydra(error)):
+        if wants_trace or not (isinstance(error, messages.BAD_INPUT) or messages.is_raised_by_hydra(error)):
             raise
-        print(f"ghgs {verb}: {messages.one_line(error, verb)}", file=sys.stderr)
+        print(f"ghgs {verb}: {messages.format_error(error, verb)}", file=sys.stderr)
         return 1
     return 0

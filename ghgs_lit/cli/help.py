@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from ghgs_lit.config.folder import conf_dir
-from ghgs_lit.config.options import did_you_mean, expected, meanings, options_of
+from ghgs_lit.config.options import describe_field, did_you_mean, meanings, options_of
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, kinds_of, verb_class, verbs
 from ghgs_lit.errors import InputError
 from ghgs_lit.parsing import read_text
@@ -60,7 +60,7 @@ def print_verb(verb: str, cfg: DictConfig, folder: str | None = None) -> None:
     print(f"{about.summary()}: {about.example}\n")
     print("== Groups (group=option; * is chosen) ==")
     for group, options in _groups(cfg, folder).items():
-        print(_filled(f"{group}: {' | '.join(options)}"))
+        print(_wrap(f"{group}: {' | '.join(options)}"))
     print(f"\nghgs {verb} --help <group> explains the keys of a group.\n\n== Keys (key=value) ==")
     print(*_fields(about, cfg), sep="\n")
     print("\n--cfg job prints the composed configuration, --info defaults says where each part comes from.")
@@ -108,10 +108,10 @@ def _fields(cls: type[BaseModel], values: Mapping[str, Any], indent: str = "") -
             continue
         is_missing = default is PydanticUndefined
         shown = "must be given" if is_missing else f"default {json.dumps(default, default=list)}"
-        yield f"{indent}{name} ({shown}; {expected(field)})"
+        yield f"{indent}{name} ({shown}; {describe_field(field)})"
         if name in texts:
-            yield _filled(" ".join(texts[name].split()), indent + "    ")
+            yield _wrap(" ".join(texts[name].split()), indent + "    ")
 
 
-def _filled(text: str, indent: str = "") -> str:
+def _wrap(text: str, indent: str = "") -> str:
     return textwrap.fill(text, 100, initial_indent=indent, subsequent_indent=indent or "  ")

@@ -47,7 +47,7 @@ _OURS = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abs
 _THEIRS = warnings.formatwarning
 
 
-def _text_of_warning(
+def _format_warning(
     message: Warning, category: type, filename: str, lineno: int, line: str | None = None
 ) -> str:
     """Text of a warning, like ``warnings.formatwarning``; for warnings of this distribution one line
@@ -64,7 +64,7 @@ def main() -> int:
         Exit code: 0: success; 1: bad input; 2: bad usage; 130, 143: interrupted.
     """
     argv = list(sys.argv)
-    warnings.formatwarning = _text_of_warning
+    warnings.formatwarning = _format_warning
     # Schedulers and daemons may have closed standard output and error.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:

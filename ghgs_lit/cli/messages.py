@@ -40,7 +40,7 @@ NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
 _LIGHTNING = ("trainer", "callbacks", "logger")
 
 
-def one_line(error: Exception, verb: str) -> str:
+def format_error(error: Exception, verb: str) -> str:
     """Message of an error on one line.
 
     Args:
@@ -48,26 +48,26 @@ def one_line(error: Exception, verb: str) -> str:
         verb: Name of the verb; its keys are suggested for misspelt ones.
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        text = _missing_option(error)
+        text = _explain_missing_option(error)
     elif isinstance(error, OverrideParseException):
-        text = _unread_override(error)
+        text = _explain_override(error)
     elif isinstance(error, HydraException):
-        text = _composition(error, verb)
+        text = _explain_composition(error, verb)
     elif isinstance(error, OSError):
-        text = _system(error)
+        text = _explain_system_error(error)
     elif isinstance(error, OmegaConfBaseException):
         text = f"{error.full_key}: expected a value that can be resolved; found {error.msg}"
     elif isinstance(error, UnknownKey) and any(word.startswith(f"{error.key}=") for word in sys.argv[1:]):
-        text = _unknown_key(error.key, verb)
+        text = _explain_unknown_key(error.key, verb)
     elif isinstance(error, InputError):
         text = str(error)
     else:  # an error of Hydra without the name of the override
-        text = _no_name_of_an_option()
+        text = _explain_numeric_option()
         text = text or f"{_command_line()}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
 
 
-def _no_name_of_an_option() -> str | None:
+def _explain_numeric_option() -> str | None:
     """Message for the first group whose option is a number or null, such as ``views=4``: Hydra's error
     contains neither group nor value. None if there is no such override."""
     for word in sys.argv[1:]:
@@ -83,7 +83,7 @@ def _command_line() -> str:
     return " ".join(word for word in sys.argv[1:] if word != NO_FILES_OF_HYDRA)
 
 
-def _unread_override(error: OverrideParseException) -> str:
+def _explain_override(error: OverrideParseException) -> str:
     key, sign, value = str(error.override).partition("=")
     if not sign or not value or value[0] in "[{\"'":
         named = error.override if sign else key
@@ -94,7 +94,7 @@ def _unread_override(error: OverrideParseException) -> str:
     )
 
 
-def _missing_option(error: MissingConfigException) -> str:
+def _explain_missing_option(error: MissingConfigException) -> str:
     """Message for an unknown group or option, in place of Hydra's, which lists the whole search path."""
     group, _, option = error.missing_cfg_file.rpartition("/")
     if not group:
@@ -106,7 +106,7 @@ def _missing_option(error: MissingConfigException) -> str:
     return f"{group}: expected {expected}; found {option!r}{hint}"
 
 
-def _composition(error: HydraException, verb: str) -> str:
+def _explain_composition(error: HydraException, verb: str) -> str:
     """Message for an unknown key, with the closest known one, or for another composition error of Hydra."""
     if chosen := re.match(r"In '([^']+)': Could not override 'ablation'", str(error)):
         expected = "no choice of an ablation, which composes last (ablation=... on the command line)"
@@ -117,10 +117,10 @@ def _composition(error: HydraException, verb: str) -> str:
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{_command_line()}: expected overrides that fit; found {error} {error.__cause__ or ''}"
-    return _unknown_key(named[1], verb)
+    return _explain_unknown_key(named[1], verb)
 
 
-def _unknown_key(key: str, verb: str) -> str:
+def _explain_unknown_key(key: str, verb: str) -> str:
     """Message for an unknown key, with the closest known one.
 
     A name is compared with names only, never with a whole dotted key, because a shared group would make
@@ -153,7 +153,7 @@ def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
         return []
 
 
-def _system(error: OSError) -> str:
+def _explain_system_error(error: OSError) -> str:
     """Message for a file that cannot be read or written; with the run's directory if the error contains
     no path."""
     if error.errno is None:  # raised by this package with a complete message
@@ -169,7 +169,7 @@ def _system(error: OSError) -> str:
     return f"{os.fsdecode(path)}: expected a file that can be read or written; found {reason}"
 
 
-def print_of_thread(arguments: threading.ExceptHookArgs) -> None:
+def print_thread_error(arguments: threading.ExceptHookArgs) -> None:
     """Exception hook of threads: print the error unless the disk is full.
 
     TensorBoard's writer thread raises such an error again where values are logged.
@@ -178,7 +178,7 @@ def print_of_thread(arguments: threading.ExceptHookArgs) -> None:
         threading.__excepthook__(arguments)
 
 
-def raised_by_hydra(error: Exception) -> bool:
+def is_raised_by_hydra(error: Exception) -> bool:
     """Whether an error concerns the command line: raised in Hydra's or OmegaConf's code, or by the YAML
     parser."""
     if isinstance(error, YAMLError):
@@ -196,7 +196,7 @@ class _Parser(argparse.ArgumentParser):
         raise BadUsage(f"{message} (--hydra-help lists the flags)")
 
 
-def parsed(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Namespace]:
+def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Namespace]:
     """Split the arguments of a verb.
 
     Args:

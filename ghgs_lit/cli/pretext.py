@@ -8,7 +8,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.cli.train import build_trainer, fit, quiet, resume_step, run_job
+from ghgs_lit.cli.train import build_trainer, fit, resume_step, run_job, silence_lightning
 from ghgs_lit.cli.verb import Training
 from ghgs_lit.errors import require
 from ghgs_lit.runs.run import RunDirectory
@@ -59,7 +59,7 @@ def pretrain(run: Training, directory: Path, stats: dict[str, Any]) -> float | N
     model = Pretext(options.build(patch_size))
     module = PretextModule(model, run.optimizer.build(), run.plain)
     step = resume_step(run, module)
-    quiet()
+    silence_lightning()
     trainer = build_trainer(run, directory, StopAtStep())
     try:
         fit(trainer, module, data, run.resume, step, stats)

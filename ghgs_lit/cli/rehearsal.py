@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ghgs_lit.cli.inputs import build_data, build_renderer, check_size, overrides
 from ghgs_lit.cli.runtime import output_dir
-from ghgs_lit.cli.train import build_trainer, quiet
+from ghgs_lit.cli.train import build_trainer, silence_lightning
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.execution.predictor import Predictor
@@ -32,7 +32,7 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
     step."""
     findings = _Findings()
     distinct = {config_hash({**run.plain, "seed": 0}): run for run in runs}
-    quiet()
+    silence_lightning()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for run in distinct.values():

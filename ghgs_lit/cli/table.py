@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Table
 
 
-def _listed(options: Options, key: str) -> tuple | None:
+def _list_values(options: Options, key: str) -> tuple | None:
     """Values of a key that holds one value or a list, None if there are none; rejects repeated values.
 
     ``key`` is dotted; its last part is the field.
@@ -25,7 +25,7 @@ def _listed(options: Options, key: str) -> tuple | None:
     return values or None
 
 
-def _expression(key: str, text: str) -> re.Pattern[str]:
+def _compile_expression(key: str, text: str) -> re.Pattern[str]:
     """Compile the regular expression of a key."""
     try:
         return re.compile(text)
@@ -35,17 +35,17 @@ def _expression(key: str, text: str) -> re.Pattern[str]:
 
 def _options(run: "Table") -> t.TableOptions:
     """Options for building tables; checks regular expressions and repeated values."""
-    unit = _expression("test.unit", run.test.unit or "(.+)")
+    unit = _compile_expression("test.unit", run.test.unit or "(.+)")
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
         layout=t.LAYOUTS[run.layout],
-        views=_listed(run.evaluation, "evaluation.views"),
-        targets=_listed(run.evaluation, "evaluation.targets"),
-        metrics=_listed(run, "columns"),
+        views=_list_values(run.evaluation, "evaluation.views"),
+        targets=_list_values(run.evaluation, "evaluation.targets"),
+        metrics=_list_values(run, "columns"),
         reported=run.reported,
         test=run.test,
         unit=unit,
-        subjects=None if run.subjects is None else _expression("subjects", run.subjects),
+        subjects=None if run.subjects is None else _compile_expression("subjects", run.subjects),
     )
 
 
@@ -59,9 +59,9 @@ def run(verb: "Table") -> None:
     write_config(verb, directory)
     options = _options(verb)
     # Resolved, so that a run found by two paths counts once.
-    folders = [resolved(path) for path in _listed(verb, "runs") or ()]
-    others = [t.read_others(Path(p).expanduser()) for p in _listed(verb, "others") or ()]
-    sweep = t.read_sweep(folders, _listed(verb, "by") or ())
+    folders = [resolved(path) for path in _list_values(verb, "runs") or ()]
+    others = [t.read_others(Path(p).expanduser()) for p in _list_values(verb, "others") or ()]
+    sweep = t.read_sweep(folders, _list_values(verb, "by") or ())
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))

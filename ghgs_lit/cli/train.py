@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Train
 
 
-def quiet() -> None:
+def silence_lightning() -> None:
     """Silence Lightning's log messages, which Hydra would print twice, and warnings that do not apply."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -178,7 +178,7 @@ def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float
     is_first = settle_rank(run.trainer) == 0
     try:
         with interruptible():
-            return (job.train_once if is_first else job.train_beside)(directory, run, train)
+            return (job.train_once if is_first else job.join_training)(directory, run, train)
     except Interrupted as stop:
         if rank_zero_only.rank == 0 and not stop.explained:
             place = f"hydra.run.dir={directory.path}"
@@ -218,7 +218,7 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
         run.feature_cache.attach(model, data)
     run = start.with_origin(run, model)
     module.config = {**module.config, **run.plain}
-    quiet()
+    silence_lightning()
     cost = TrainingCost()
     trainer = build_trainer(run, directory, cost, StopAtStep(), NeighborsAtStart())
     module.metrics = run.metrics.build().to(trainer.strategy.root_device)

@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
-from ghgs_lit.config.defaults import fill, of_verb
+from ghgs_lit.config.defaults import fill, verb_values
 from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
@@ -38,7 +38,7 @@ def _application() -> Iterator[None]:
         GlobalHydra.instance().hydra = running
 
 
-def _is_own() -> bool:
+def _is_own_application() -> bool:
     """Whether the running Hydra application, if any, searches ``conf``; those of other programs do not."""
     if not GlobalHydra.instance().is_initialized():
         return False
@@ -60,7 +60,7 @@ def store_defaults(verb: str, folder: str | None = None) -> None:
     if any(Path(place, f"{verb}.yaml").is_file() for place in (conf_dir(), folder) if place is not None):
         return
     node = {"defaults": ["_self_", {"override hydra/output": "ghgs"}], "hydra": {"job": {"name": verb}}}
-    store.store(name=verb, node=of_verb(verb, node))
+    store.store(name=verb, node=verb_values(verb, node))
 
 
 def compose(
@@ -148,7 +148,7 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
             file = f"{group}/{hydra_node.runtime.choices.get(group)}.yaml"
             raise InputError(f"{file}: expected the first line '# @package _global_'; found none")
     name = hydra_node.runtime.choices.get("ablation")
-    wanted = _set_by_ablation(name)
+    wanted = _ablation_values(name)
     composed = OmegaConf.to_container(cfg)
     # with interpolations as typed
     overrides = OmegaConf.to_container(hydra_node.overrides.task)
@@ -159,7 +159,7 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
         require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", present)
 
 
-def _set_by_ablation(name: str | None) -> dict[str, Any]:
+def _ablation_values(name: str | None) -> dict[str, Any]:
     """Dotted keys set by an option of the group ``ablation``, with its values; empty for None."""
     if name is None:
         return {}
@@ -181,7 +181,7 @@ def chosen_options(config: Mapping[str, Any], hydra_node: DictConfig) -> dict[st
     """
     choices = hydra_node.runtime.choices
     names = {group: choices.get(group) for group in ("model", "encoder", "ablation")}
-    return {**names, "sets": {key: lookup(config, key) for key in _set_by_ablation(names["ablation"])}}
+    return {**names, "sets": {key: lookup(config, key) for key in _ablation_values(names["ablation"])}}
 
 
 def read_options(group: str, names: Sequence[str], run: Run, key: str) -> dict[str, dict[str, Any]]:
@@ -213,7 +213,7 @@ def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]
     Raises:
         InputError: The group has no such option.
     """
-    with nullcontext() if _is_own() else _application():
+    with nullcontext() if _is_own_application() else _application():
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
         if name in known:
             node = OmegaConf.select(fill(hydra.compose(f"{group}/{name}")), group.replace("/", "."))

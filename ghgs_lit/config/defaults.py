@@ -28,34 +28,34 @@ def with_defaults(values: Mapping[str, Any], cls: type[BaseModel]) -> dict[str, 
     """
     full: dict[str, Any] = {}
     for name, field in cls.model_fields.items():
-        default = MISSING if field.is_required() else _plain(field.get_default(call_default_factory=True))
+        default = MISSING if field.is_required() else _to_plain(field.get_default(call_default_factory=True))
         value = values.get(name, default)
         nested = None if get_origin(field.annotation) in (tuple, dict) else options_of(field.annotation)
         if nested is not None and isinstance(value, Mapping):
-            value = with_defaults(_over(default, value), nested)
+            value = with_defaults(_merge(default, value), nested)
         full[name] = value
     kept = {name: value for name, value in full.items() if name in values or value != MISSING}
     return kept | {name: value for name, value in values.items() if name not in full}
 
 
-def _over(default: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(default: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Merge values over those of a default that is a mapping, too."""
     if not isinstance(default, Mapping):
         return dict(values)
     merged = dict(default)
     for name, value in values.items():
-        merged[name] = _over(default.get(name), value) if isinstance(value, Mapping) else value
+        merged[name] = _merge(default.get(name), value) if isinstance(value, Mapping) else value
     return merged
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Convert a default to plain data; of options, only fields that were set."""
     if isinstance(value, BaseModel):
-        return {name: _plain(getattr(value, name)) for name in value.model_fields_set}
-    return list(map(_plain, value)) if isinstance(value, tuple) else value
+        return {name: _to_plain(getattr(value, name)) for name in value.model_fields_set}
+    return list(map(_to_plain, value)) if isinstance(value, tuple) else value
 
 
-def of_verb(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def verb_values(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Configuration of a verb with all of its keys; required keys without a value are ``???``.
 
     Args:

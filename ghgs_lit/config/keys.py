@@ -146,9 +146,9 @@ def ablation_of(config: Mapping[str, Any]) -> str:
         which the command line may have set one by one.
     """
     name = lookup(config, "chosen.ablation")
-    return name if is_own_ablation(name) else ABLATIONS[switches_of(config)]
+    return name if is_custom_ablation(name) else ABLATIONS[switches_of(config)]
 
 
-def is_own_ablation(name: Any) -> bool:
+def is_custom_ablation(name: Any) -> bool:
     """Whether ``name`` is a user-defined option of the group ``ablation``."""
     return isinstance(name, str) and name not in ABLATIONS.values()

@@ -43,9 +43,9 @@ class Words:
     text: str
 
 
-def expected(field: FieldInfo) -> str:
+def describe_field(field: FieldInfo) -> str:
     """Describe the values that ``field`` accepts, such as "an integer >= 1 or null"."""
-    return _words(field.annotation, field.metadata)
+    return _describe_type(field.annotation, field.metadata)
 
 
 def options_of(annotation: Any) -> type[BaseModel] | None:
@@ -69,31 +69,31 @@ def meanings(cls: type) -> dict[str, str]:
     return texts
 
 
-def _flat(metadata: Iterable[Any]) -> list[Any]:
+def _flatten_metadata(metadata: Iterable[Any]) -> list[Any]:
     """Metadata of a type, including those inside pydantic's ``Field``."""
     return [part for item in metadata for part in (item.metadata if isinstance(item, FieldInfo) else [item])]
 
 
-def _words(annotation: Any, metadata: Iterable[Any] = ()) -> str:
-    metadata = _flat(metadata)
+def _describe_type(annotation: Any, metadata: Iterable[Any] = ()) -> str:
+    metadata = _flatten_metadata(metadata)
     if get_origin(annotation) is Annotated:
         inner, *further = get_args(annotation)
-        return _words(inner, [*metadata, *further])
+        return _describe_type(inner, [*metadata, *further])
     for item in metadata:
         if isinstance(item, Words):
             return item.text
     origin = get_origin(annotation)
     args = get_args(annotation)
     if origin in (Union, types.UnionType):
-        return " or ".join(_words(arg, () if arg is type(None) else metadata) for arg in args)
+        return " or ".join(_describe_type(arg, () if arg is type(None) else metadata) for arg in args)
     if origin is Literal:
         return "one of " * (len(args) > 1) + ", ".join(map(str, args))
     if origin is tuple:
         if len(args) == 2 and args[1] is Ellipsis:
-            return f"a list (each {_words(args[0])})"
-        return f"a list of {len(args)} values (each {_words(args[0])})"
+            return f"a list (each {_describe_type(args[0])})"
+        return f"a list of {len(args)} values (each {_describe_type(args[0])})"
     if origin is dict:
-        return f"a mapping (each {_words(args[1])})"
+        return f"a mapping (each {_describe_type(args[1])})"
     if options_of(annotation) is not None:
         return "a mapping of its keys"
     limits = {name: getattr(item, name) for item in metadata for name in _LIMITS if hasattr(item, name)}
@@ -105,7 +105,7 @@ def _words(annotation: Any, metadata: Iterable[Any] = ()) -> str:
 _T = TypeVar("_T", bound="Options")
 
 
-def _text(value: Any) -> Any:
+def _to_text(value: Any) -> Any:
     """Convert a path or an integer, such as the name ``100846``, to text; floats such as 2024.10 have
     lost their spelling and are rejected."""
     if isinstance(value, float):
@@ -114,19 +114,19 @@ def _text(value: Any) -> Any:
     return str(value) if is_number else os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def _has_home(path: str) -> str:
+def _check_home(path: str) -> str:
     if os.path.expanduser(path).startswith("~"):
         raise ValueError("a path, after ~ nothing or a user of this machine")
     return path
 
 
-def _pair(size: int | tuple[int, int]) -> tuple[int, int]:
+def _to_pair(size: int | tuple[int, int]) -> tuple[int, int]:
     return (size, size) if isinstance(size, int) else size
 
 
-Text = Annotated[str, Field(min_length=1), BeforeValidator(_text)]
+Text = Annotated[str, Field(min_length=1), BeforeValidator(_to_text)]
 PathText = Annotated[
-    str, Field(min_length=1), BeforeValidator(_text), AfterValidator(_has_home), Words("a path")
+    str, Field(min_length=1), BeforeValidator(_to_text), AfterValidator(_check_home), Words("a path")
 ]
 Count = Annotated[int, Field(ge=1)]
 Index = Annotated[int, Field(ge=0)]
@@ -141,10 +141,10 @@ Patches = Annotated[int, Field(ge=0, le=8192)]
 # A larger image would take gigabytes before any check could reject it.
 Side = Annotated[int, Field(ge=1, le=8192)]
 #: Side or [height, width] in pixels; read as (height, width).
-Size = Annotated[Side | tuple[Side, Side], AfterValidator(_pair)]
+Size = Annotated[Side | tuple[Side, Side], AfterValidator(_to_pair)]
 CropSide = Annotated[int, Field(ge=1, le=2072)]
 #: The same for crops, the input of the model.
-CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)]
+CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_to_pair)]
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
@@ -197,18 +197,18 @@ class Options(BaseModel, metaclass=_Checked):
 
     @model_validator(mode="before")
     @classmethod
-    def _given(cls, values: Any) -> Any:
+    def _normalize(cls, values: Any) -> Any:
         """Convert lists to tuples; a mapping given for a field whose default is options changes only its
         keys."""
         if not isinstance(values, dict):
             return values
-        given = _immutable(values)
+        given = _make_immutable(values)
         for name, value in given.items():
             default = cls.model_fields[name].default if name in cls.model_fields else None
             if isinstance(value, dict) and isinstance(default, Options):
                 given[name] = {**dict(default), **value}
             elif isinstance(value, str) and re.fullmatch(r"[+-]?\d[\d_]*", value):
-                words = expected(cls.model_fields[name]) if name in cls.model_fields else ""
+                words = describe_field(cls.model_fields[name]) if name in cls.model_fields else ""
                 given[name] = value if re.search("text|path|mapping", words) else int(value)
         return given
 
@@ -256,7 +256,7 @@ class Options(BaseModel, metaclass=_Checked):
         """
         if not condition:
             raise InputError(
-                f"{name}: expected {expected}; found {format_value(_plain(getattr(self, name)))}"
+                f"{name}: expected {expected}; found {format_value(_to_plain(getattr(self, name)))}"
             )
 
     def build(self) -> Any:
@@ -264,16 +264,16 @@ class Options(BaseModel, metaclass=_Checked):
         return self
 
 
-def _immutable(value: Any) -> Any:
+def _make_immutable(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(map(_immutable, value))
-    return {key: _immutable(item) for key, item in value.items()} if isinstance(value, dict) else value
+        return tuple(map(_make_immutable, value))
+    return {key: _make_immutable(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, tuple):
-        return list(map(_plain, value))
-    return {key: _plain(item) for key, item in value.items()} if isinstance(value, dict) else value
+        return list(map(_to_plain, value))
+    return {key: _to_plain(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
@@ -309,8 +309,8 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         return UnknownKey(f"{dotted} key: {text}" if dotted else f"{name}: {text}", ".".join([*path, name]))
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
-    wanted = str(cause) if cause is not None else expected(field) if field is not None else first["msg"]
-    return InputError(f"{dotted}: expected {wanted}; found {format_value(_plain(values))}")
+    wanted = str(cause) if cause is not None else describe_field(field) if field is not None else first["msg"]
+    return InputError(f"{dotted}: expected {wanted}; found {format_value(_to_plain(values))}")
 
 
 def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:

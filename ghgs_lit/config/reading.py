@@ -24,7 +24,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, _utils
 
-from ghgs_lit.config.defaults import of_verb, open_nodes
+from ghgs_lit.config.defaults import open_nodes, verb_values
 from ghgs_lit.config.folder import conf_dir
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.registry import verbs
@@ -65,18 +65,18 @@ class FileConfigSource(file_config_source.FileConfigSource):
         if Path(self.path) == conf_dir() or not file.is_file():
             result = super().load_config(config_path)
         else:
-            header, config = read_parsed(file, "YAML", _parsed)
+            header, config = read_parsed(file, "YAML", _parse)
             result = ConfigResult(self.provider, f"file://{self.path}", config, header)
             check_file(file, config_path, header.get("package") or "", config)
         if OmegaConf.is_dict(result.config):
             name = config_path.removesuffix(".yaml")
             if name in verbs():
-                result.config = OmegaConf.create(of_verb(name, OmegaConf.to_container(result.config)))
+                result.config = OmegaConf.create(verb_values(name, OmegaConf.to_container(result.config)))
             open_nodes(name, result.header.get("package") or "", result.config)
         return result
 
 
-def _parsed(text: str) -> tuple[dict[str, str | None], DictConfig]:
+def _parse(text: str) -> tuple[dict[str, str | None], DictConfig]:
     """Header of a file as Hydra reads it, and the content."""
     check_yaml(text, most=_MOST_VALUES)
     return FileConfigSource._get_header_dict(text[:512]), OmegaConf.load(io.StringIO(text))
@@ -137,7 +137,7 @@ class SpellingVisitor(HydraOverrideVisitor):
         value = super()._createPrimitive(ctx)
         if self._are_numbers or not (type(value) is int or (type(value) is float and self._is_path)):
             return value
-        return _spelled(value, ctx.getText().strip())
+        return _keep_spelling(value, ctx.getText().strip())
 
 
 def yaml_loader() -> type[yaml.SafeLoader]:
@@ -148,10 +148,10 @@ def yaml_loader() -> type[yaml.SafeLoader]:
 
 
 def _construct_int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
-    return _spelled(loader.construct_yaml_int(node), node.value)
+    return _keep_spelling(loader.construct_yaml_int(node), node.value)
 
 
-def _spelled(value: float, text: str) -> float | str:
+def _keep_spelling(value: float, text: str) -> float | str:
     """The number, or its text if numbers are not usually written this way."""
     return value if str(value) == text.removeprefix("+") else text
 

@@ -44,14 +44,14 @@ def load_plugins() -> None:
         InputError: A file is missing, or another module has its name.
     """
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
-    for name in (*names, *_installed()):
+    for name in (*names, *_installed_plugins()):
         # Files opened while the collector is disabled would be frozen, and not flushed at exit.
         gc.enable()
         importlib.import_module(name)
 
 
 @cache
-def _installed() -> tuple[str, ...]:
+def _installed_plugins() -> tuple[str, ...]:
     return tuple(point.value for point in importlib.metadata.entry_points(group=GROUP))
 
 

@@ -18,7 +18,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.results import config_hash
-from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, begun_by_job
+from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, find_runs_of_job
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training
@@ -38,7 +38,7 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def _waits() -> bool:
+def _must_wait() -> bool:
     """Whether to wait for a locked run: the grid sweeper retries it later, other sweepers need its result
     now."""
     return in_sweep() and HydraConfig.get().sweeper.get("_target_") != SWEEPER
@@ -62,11 +62,11 @@ def register_resolvers() -> None:
         runs = Path("runs", _root_.hydra.job.name)
         if name.startswith("sweep_"):
             command = list(_root_.hydra.overrides.task)
-            sweeps = {run.path.parent for run in begun_by_job(runs, f"sweep_*/*/{MARKER}")}
+            sweeps = {run.path.parent for run in find_runs_of_job(runs, f"sweep_*/*/{MARKER}")}
             folders = [sweep for sweep in sweeps if lookup(read_yaml(sweep / PLAN), _TASK) == command]
         else:
             own_hash = hash_of_run(_root_=_root_)
-            begun = begun_by_job(runs, f"*/{MARKER}")
+            begun = find_runs_of_job(runs, f"*/{MARKER}")
             folders = [run.path for run in begun if run.marker.config_hash == own_hash]
         return max((path.name for path in folders), default=name)
 
@@ -98,14 +98,14 @@ def train_once(directory: RunDirectory, run: "Training", train: Train) -> float 
     """
     directory = directory.of(run)
     path = directory.path
-    with directory.claim(wait=_waits()) as claimed:
+    with directory.claim(wait=_must_wait()) as claimed:
         if not claimed and in_sweep():
             print(f"skipped: {directory.owner} works on {path}", flush=True)
             return BUSY
         if not claimed:
             expected = "a directory that no process works in"
             raise InputError(f"{path}: expected {expected}; found {directory.owner}")
-        if directory.done and (in_sweep() or directory.goes_on(run)):
+        if directory.done and (in_sweep() or directory.continues(run)):
             print(f"done before: {path}", flush=True)
             return directory.metric
         run = directory.begin(run)
@@ -113,7 +113,7 @@ def train_once(directory: RunDirectory, run: "Training", train: Train) -> float 
             return train(run, path, stats)
 
 
-def train_beside(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
+def join_training(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
     """Train a run in a further process of a training whose first process is in :func:`train_once`.
 
     Args:
@@ -129,8 +129,8 @@ def train_beside(directory: RunDirectory, run: "Training", train: Train) -> floa
     """
     directory = directory.of(run)
     end = time.monotonic() + _PATIENCE
-    while (session := directory.session_beside()) is None:
-        if directory.done and (in_sweep() or directory.goes_on(run)):
+    while (session := directory.find_first_session()) is None:
+        if directory.done and (in_sweep() or directory.continues(run)):
             return directory.metric
         expected = "the first process of this training to work in it"
         require(time.monotonic() < end, str(directory.path), expected, directory.owner)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from tabulate import tabulate
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.progress import clock
+from ghgs_lit.runs.progress import format_duration
 from ghgs_lit.runs.run import RunDirectory, State
 
 if TYPE_CHECKING:
@@ -114,21 +114,21 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
         if measured and trainer.max_steps > 0:
             times.append(trainer.max_steps * measured[0])
         expected = min(times, default=None)
-        budgets.append(f"{trainer.max_steps} steps" if expected is None else clock(expected))
+        budgets.append(f"{trainer.max_steps} steps" if expected is None else format_duration(expected))
         if not is_done:
             remaining.append(expected)
     states = print_states(planned, {"trains for": budgets}, "; nothing was run")
     basis = ["trainer.max_time"] if is_limited else []
     if measured:
         basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
-    total = "unknown" if None in remaining else clock(sum(remaining))
+    total = "unknown" if None in remaining else format_duration(sum(remaining))
     reason = "; ".join(basis) or "no trainer.max_time, and no step was measured"
     print(f"expected training time of the remaining runs, one after another: {total} ({reason})")
     place = f"{directory}/<run>" if len(planned) > 1 else planned[0].directory.path
     print(f"outputs: {place}/ with {OUTPUTS}", flush=True)
     for note in rehearsal.notes:
         print(f"note: {note}")
-    reasons = [*rehearsal.reasons, *_unreadable(planned, states)]
+    reasons = [*rehearsal.reasons, *_find_unreadable(planned, states)]
     for reason in reasons:
         print(f"would be refused: {reason}", flush=True)
     count = len(reasons)
@@ -136,7 +136,7 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
         raise InputError(f"dry_run: expected runs that lack nothing; found {count} missing, as said above")
 
 
-def _unreadable(planned: Sequence[PlannedRun], states: Sequence[State]) -> list[str]:
+def _find_unreadable(planned: Sequence[PlannedRun], states: Sequence[State]) -> list[str]:
     """One line for each checkpoint that a run would resume from but that cannot be read."""
     from ghgs_lit.weights.checkpoint import read_checkpoint  # here: it imports PyTorch
 

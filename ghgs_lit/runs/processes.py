@@ -65,7 +65,7 @@ def in_srun() -> bool:
     return is_task and os.environ.get("SLURM_JOB_NAME") not in ("bash", "interactive")
 
 
-def launch() -> str | None:
+def launch_id() -> str | None:
     """Identifier shared by all processes that were started together: the job step or torchrun's run ID,
     with the number of restarts; None without a launcher."""
     names = {

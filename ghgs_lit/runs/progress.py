@@ -34,7 +34,7 @@ class Lines:
         self.printed = printed
         self._next = time.monotonic()
 
-    def due(self) -> bool:
+    def is_due(self) -> bool:
         """Whether to write a line now: True at the first call, then once every ``every`` seconds."""
         now = time.monotonic()
         if now < self._next:
@@ -56,7 +56,7 @@ class Lines:
                 file.write(line + "\n")
 
 
-def clock(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration, rounded to whole seconds, as ``h:mm:ss``, such as ``1:02:03``."""
     return str(datetime.timedelta(seconds=round(seconds)))
 
@@ -79,6 +79,6 @@ def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
     lines = Lines(every=every)
     started = time.monotonic()
     for done, item in enumerate(items):
-        if lines.due() and done:
-            lines.write(f"{text}: {done}{total}, {clock(time.monotonic() - started)}")
+        if lines.is_due() and done:
+            lines.write(f"{text}: {done}{total}, {format_duration(time.monotonic() - started)}")
         yield item

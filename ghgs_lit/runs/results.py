@@ -45,7 +45,7 @@ def metric_names(rows: Sequence[Row]) -> list[str]:
     return [name for name in names if name not in KEYS]
 
 
-def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
+def group_by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
     """Group rows by (method, views, targets), then by subject."""
     groups: dict[tuple, dict[str, list[Row]]] = {}
     for row in rows:
@@ -64,7 +64,7 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     """
     names = metric_names(rows)
     summary = []
-    for (method, views, targets), subjects in by_protocol(rows).items():
+    for (method, views, targets), subjects in group_by_protocol(rows).items():
         entry = {"method": method, "views": views, "targets": targets, "subjects": len(subjects)}
         for name in names:
             of_subjects = []
@@ -152,7 +152,7 @@ class _Results(BaseModel):
     rows: list[_Row]
 
 
-def validated(model: type[Model], content: Any, where: str) -> Model:
+def validate(model: type[Model], content: Any, where: str) -> Model:
     """Validate content with a pydantic model.
 
     Args:
@@ -189,7 +189,7 @@ def read_results(path: Path) -> dict[str, Any]:
     if found != FORMAT_VERSION:
         again = "`ghgs evaluate` measures again"
         raise InputError(f"{path}: expected format_version {FORMAT_VERSION}; found {found} ({again})")
-    source = validated(_Results, content, str(path)).provenance
+    source = validate(_Results, content, str(path)).provenance
     if isinstance(source.get("config"), dict):
         fitting = config_hash(source["config"])
         hashed = source.get("config_hash")

@@ -35,8 +35,8 @@ from ghgs_lit.files import (
     write_text_atomically,
 )
 from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
-from ghgs_lit.runs.processes import is_queued_again, launch, slurm_job
-from ghgs_lit.runs.results import config_hash, differences, read_results, validated
+from ghgs_lit.runs.processes import is_queued_again, launch_id, slurm_job
+from ghgs_lit.runs.results import config_hash, differences, read_results, validate
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training
@@ -223,7 +223,7 @@ class RunDirectory:
         path = self.path / MARKER
         if not path.is_file():
             return None
-        return validated(Identity, read_json(path, "a run's identity"), str(path))
+        return validate(Identity, read_json(path, "a run's identity"), str(path))
 
     def start(self, run: "Training") -> str | None:
         """Checkpoint from which a run starts in this directory. Writes nothing.
@@ -242,20 +242,20 @@ class RunDirectory:
             require_no_links(self.path.parent, (_CURVES, str(self.curves.relative_to(self.path.parent))))
         resume = run.resume
         given = None if resume == AUTO else resume
-        if self._has(resume) or self.goes_on(run):
+        if self._has(resume) or self.continues(run):
             checkpoint = resume if self._has(resume) else self.checkpoint
             return str(checkpoint) if checkpoint is not None else given
         owned = self.marker is not None
-        there = self._there(*WRITTEN) if owned else self._there(*WRITTEN, SESSIONS)
+        there = self._find_existing(*WRITTEN) if owned else self._find_existing(*WRITTEN, SESSIONS)
         if not there:
             return given
         if not (run.overwrite and owned):
-            raise InputError(f"{self.path}: {self._refusal(run, there[0], owned)}")
+            raise InputError(f"{self.path}: {self._rejection(run, there[0], owned)}")
         for key, source in (("init_from", getattr(run, "init_from", None)), ("resume", resume)):
             require(not self._has(source), key, "a file outside the run that overwrite=true deletes", source)
         return given
 
-    def goes_on(self, run: "Training") -> bool:
+    def continues(self, run: "Training") -> bool:
         """Whether the same command began the run in this directory. In an incomplete run, the length of
         training and the evaluation may differ."""
         marker = self.marker
@@ -268,14 +268,14 @@ class RunDirectory:
         is_complete = RunDirectory(self.path).done
         return not is_complete and marker.settings_hash == config_hash(run.plain, MAY_CHANGE_ON_RESUME)
 
-    def _there(self, *names: str) -> list[str]:
+    def _find_existing(self, *names: str) -> list[str]:
         return [name for name in names if os.path.lexists(self.path / name)]
 
     def _has(self, path: str | None) -> bool:
         """Whether ``path`` is a file of this run."""
         return path not in (None, AUTO) and resolved(path).is_relative_to(self.path)
 
-    def _refusal(self, run: Run, there: str, owned: bool) -> str:
+    def _rejection(self, run: Run, there: str, owned: bool) -> str:
         ways = "hydra.run.dir or hydra.sweep.subdir name another"
         if self.checkpoint is not None:
             ways += f", resume={self.checkpoint} goes on with its weights"
@@ -303,7 +303,7 @@ class RunDirectory:
         """
         start = self.start(run)
         marker = self.marker
-        is_same = self.goes_on(run)
+        is_same = self.continues(run)
         if not self._has(start):
             self._clear(run, with_sessions=not is_same)
         known = marker if is_same or self._has(start) else None
@@ -382,7 +382,7 @@ class RunDirectory:
         """
         if self._has(resumed):
             resumed = str(resolved(resumed).relative_to(self.path))
-        process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch()}
+        process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch_id()}
         self._log("started", **process, resumed=resumed)
         stats: dict[str, Any] = {}
         try:
@@ -393,11 +393,11 @@ class RunDirectory:
             raise
         self._log("ended", outcome="done", **stats)
 
-    def session_beside(self) -> dict[str, Any] | None:
+    def find_first_session(self) -> dict[str, Any] | None:
         """Current session of the first of the processes started together with this one, with the absolute
         path of the checkpoint that it ``resumed`` from; None if it has not begun."""
         last = (self.sessions() or [{}])[-1]
-        if last.get("launch") != launch() or "outcome" in last or not is_locked(self._lock):
+        if last.get("launch") != launch_id() or "outcome" in last or not is_locked(self._lock):
             return None
         resumed = last["resumed"]
         return {**last, "resumed": resumed and str(self.path / resumed)}
@@ -412,7 +412,7 @@ def _owner_of(curves: Path) -> str | None:
     return path.read_text(errors="replace") if path.is_file() else None
 
 
-def begun_by_job(folder: Path, pattern: str) -> list[RunDirectory]:
+def find_runs_of_job(folder: Path, pattern: str) -> list[RunDirectory]:
     """Runs on which the current SLURM job has worked; none outside SLURM.
 
     Args:

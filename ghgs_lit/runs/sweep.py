@@ -78,7 +78,7 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
     try:
         with interruptible():
             planned = _plan(sweeper, arguments, directory)
-            _print_differing(planned, directory)
+            _print_differences(planned, directory)
             if config.get("dry_run"):
                 print_plan(planned, directory, rehearse)
                 return []
@@ -149,7 +149,7 @@ def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> l
         name = config_hash(run.plain)
         # The job writes to the planned directory, whatever job number the launcher assigns.
         places = {"dir": str(directory), "subdir": subdirectory}
-        fixed = (f"hydra.sweep.{key}={_quoted(place)}" for key, place in places.items())
+        fixed = (f"hydra.sweep.{key}={_quote(place)}" for key, place in places.items())
         place = RunDirectory(directory / subdirectory, name)
         shown = tuple(filter_overrides(overrides))
         planned.setdefault(name, PlannedRun(name, (*overrides, *fixed), shown, run, place))
@@ -160,7 +160,7 @@ def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> l
     return runs
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     """Quote text as the value of an override."""
     return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text) + "'"
 
@@ -182,7 +182,7 @@ def _check(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -
         check_config(item.run)
 
 
-def _print_differing(planned: Sequence[PlannedRun], directory: Path) -> None:
+def _print_differences(planned: Sequence[PlannedRun], directory: Path) -> None:
     """Print the keys that differ if the directory holds a sweep to which none of these runs belongs: the
     user has probably changed a key by mistake."""
     if any(item.directory.swept for item in planned):

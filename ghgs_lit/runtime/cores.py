@@ -40,7 +40,7 @@ def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg"
         os.environ["GOMP_SPINCOUNT"] = _TURNS
 
 
-def children_sleep() -> None:
+def let_children_sleep() -> None:
     """Keep child processes started from now on from spinning; see :func:`spin_if_alone`."""
     if _spins:
         os.environ.pop("GOMP_SPINCOUNT", None)

@@ -44,7 +44,7 @@ class Watcher:
 
 
 @contextmanager
-def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
+def watch_stages(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
     """Call a watcher at every call of the stages while the context is active.
 
     Args:
@@ -68,7 +68,7 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
 
 
 @contextmanager
-def inside(stage: str, watcher: Watcher) -> Iterator[None]:
+def watch_block(stage: str, watcher: Watcher) -> Iterator[None]:
     """Report the body of the context to ``watcher`` as a stage."""
     watcher.begin(stage)
     yield

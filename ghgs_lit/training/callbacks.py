@@ -15,7 +15,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
-from ghgs_lit.runs.progress import Lines, clock, on_terminal
+from ghgs_lit.runs.progress import Lines, format_duration, on_terminal
 
 
 class ProgressOptions(Options):
@@ -46,7 +46,7 @@ class RunProgress(Callback):
         """Update the bar, and write a line if one is due."""
         step = trainer.global_step
         # Between two batches of an accumulated step nothing has changed.
-        is_due = trainer.is_global_zero and step > self._written and self._lines.due()
+        is_due = trainer.is_global_zero and step > self._written and self._lines.is_due()
         if is_due or not self._bar.disable:  # reading a step's values is a synchronisation
             text = self._text(trainer, pl_module.used_budget)
             self._bar.update(self._task, completed=pl_module.used_budget, description=text)
@@ -65,7 +65,7 @@ class RunProgress(Callback):
         elif self._first is not None and used > self._first[2]:
             seconds = now - self._first[0]
             parts.append(f"{(step - self._first[1]) / seconds:.3g} steps/s")
-            parts.append(f"{clock(seconds * (1 - used) / (used - self._first[2]))} left")
+            parts.append(f"{format_duration(seconds * (1 - used) / (used - self._first[2]))} left")
         return "  ".join(parts)
 
     def on_train_end(self, *args: Any) -> None:

@@ -11,7 +11,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.method.model import STAGES
 from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
-from ghgs_lit.runtime.watching import Stopwatch, watched
+from ghgs_lit.runtime.watching import Stopwatch, watch_stages
 
 #: Parts of a step, in order.
 PARTS = ("data", *STAGES, "rounds", "render", "loss", "backward", "optimizer")
@@ -56,7 +56,7 @@ class Costs(Callback):
         else:
             has_rounds = not isinstance(getattr(pl_module.model, "rounds", None), NoRounds)
             places = {part: place for part, place in _PLACES.items() if part != "rounds" or has_rounds}
-            self._stack.enter_context(watched(pl_module, places, self._watch))
+            self._stack.enter_context(watch_stages(pl_module, places, self._watch))
 
     def on_before_backward(self, *args: Any) -> None:
         """Start timing the backward pass."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_atomically
 from ghgs_lit.method.model import STAGES
-from ghgs_lit.runtime.watching import Inputs, Watcher, watched
+from ghgs_lit.runtime.watching import Inputs, Watcher, watch_stages
 from ghgs_lit.training.optimization import named_weights
 from ghgs_lit.types import Batch, map_tensors
 
@@ -101,7 +101,7 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
     fault.check("batch", step.batch)
     precision = module.trainer.precision_plugin
     try:
-        with torch.enable_grad(), watched(module, _STAGES, fault), precision.train_step_context():
+        with torch.enable_grad(), watch_stages(module, _STAGES, fault), precision.train_step_context():
             total = module.forward_losses(step)[1]
             slopes = torch.autograd.grad(total * scale, list(trained.values()), allow_unused=True)
     except Exception:  # a stage may reject values that are not finite

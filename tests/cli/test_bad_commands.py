@@ -113,7 +113,7 @@ def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
 def test_threads_say_nothing_of_a_full_disk(capfd):
     """Regression: TensorBoard's thread printed a traceback in addition to the error that it raises later."""
     for number in (errno.ENOSPC, errno.EIO):
-        messages.print_of_thread(threading.ExceptHookArgs((OSError, OSError(number, "x"), None, None)))
+        messages.print_thread_error(threading.ExceptHookArgs((OSError, OSError(number, "x"), None, None)))
     assert capfd.readouterr().err.count("OSError") == 1
 
 

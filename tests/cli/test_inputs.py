@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import open_dict
 
 from ghgs_lit.cli import inputs
-from ghgs_lit.cli.application import _for_hydra
+from ghgs_lit.cli.application import _rewrite_overrides
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.config.compose import plain
 from ghgs_lit.config.registry import class_of, verb_class
@@ -32,7 +32,7 @@ def composed(monkeypatch):
     """Compose a verb as on the command line, so that its overrides are available."""
 
     def composed(verb, *overrides):
-        cfg = compose(verb, _for_hydra(verb, list(overrides)), with_hydra=True)
+        cfg = compose(verb, _rewrite_overrides(verb, list(overrides)), with_hydra=True)
         monkeypatch.setattr(HydraConfig.instance(), "cfg", copy.deepcopy(cfg))
         with open_dict(cfg):
             del cfg["hydra"]

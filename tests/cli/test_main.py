@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli import application
-from ghgs_lit.cli.messages import parsed
+from ghgs_lit.cli.messages import parse_arguments
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.cli.verbs import Train
 from ghgs_lit.config import compose, run_of
@@ -105,11 +105,11 @@ def test_help_of_every_verb_names_its_keys(monkeypatch, capsys, verb):
 
 def test_what_lightning_says_of_itself_is_not_shown():
     """Lightning's messages appeared twice, and its advice does not apply."""
-    from ghgs_lit.cli.train import quiet
+    from ghgs_lit.cli.train import silence_lightning
 
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
-        quiet()
+        silence_lightning()
         warnings.warn("'train_dataloader' does not have many workers: increase `num_workers`", stacklevel=1)
         warnings.warn("Checkpoint directory a exists and is not empty.", stacklevel=1)
     assert shown == []
@@ -176,9 +176,9 @@ def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_pa
 
 def test_flags_may_stand_anywhere():
     """Hydra accepts no flags between overrides."""
-    flags, overrides, _ = parsed(["seed=1", "-m", "--config-dir", "x", "seed=2"])
+    flags, overrides, _ = parse_arguments(["seed=1", "-m", "--config-dir", "x", "seed=2"])
     assert (flags, overrides) == (["-m", "--config-dir", "x"], ["seed=1", "seed=2"])
-    assert parsed(["--cfg=job", "seed=1"])[:2] == (["--cfg=job"], ["seed=1"])
+    assert parse_arguments(["--cfg=job", "seed=1"])[:2] == (["--cfg=job"], ["seed=1"])
 
 
 class Seeded(BaseException):

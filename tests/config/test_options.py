@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.config import conf_dir, run_of
 from ghgs_lit.config.keys import flatten
-from ghgs_lit.config.options import expected, meanings, options_of
+from ghgs_lit.config.options import describe_field, meanings, options_of
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_nodes, verb_class, verbs
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed, verb_with
@@ -112,7 +112,7 @@ def numbers(cls, prefix=""):
     for name, field in cls.model_fields.items():
         if (nested := options_of(field.annotation)) is not None:
             yield from numbers(nested, f"{prefix}{name}.")
-        elif re.search(r"an integer( >=? -?\d+)?( or|\)|$)", expected(field)):
+        elif re.search(r"an integer( >=? -?\d+)?( or|\)|$)", describe_field(field)):
             yield f"{prefix}{name}"
 
 

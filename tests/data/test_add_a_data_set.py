@@ -55,9 +55,9 @@ def clean(monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(registry.VARIABLE, raising=False)
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    registry._installed.cache_clear()
+    registry._installed_plugins.cache_clear()
     yield
-    registry._installed.cache_clear()
+    registry._installed_plugins.cache_clear()
     for name in ("my_people", "numbers_of_mine"):
         sys.modules.pop(name, None)
 
@@ -154,12 +154,12 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
         with pytest.raises(InputError, match="my_people"):
             build(node(project), "data")
         admit()
-        registry._installed.cache_clear()
+        registry._installed_plugins.cache_clear()
         assert build(node(project), "data", **KEYS).dataset.name == "m"
         monkeypatch.delenv(registry.VARIABLE, raising=False)
         registry._REGISTERED.clear()
         sys.modules.pop("my_people")
-        registry._installed.cache_clear()
+        registry._installed_plugins.cache_clear()
 
 
 def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.rendering.capacity import Rooms
-from ghgs_lit.runtime.watching import Watcher, watched
+from ghgs_lit.runtime.watching import Watcher, watch_stages
 from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.models import ATTRIBUTES, close, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
@@ -104,7 +104,7 @@ def test_what_is_watched_or_has_a_gradient_is_called():
     for _ in range(2):
         model(scene())
     before = counts(model)
-    with watched(model.model, {"head": "gaussian_head"}, Watcher()):
+    with watch_stages(model.model, {"head": "gaussian_head"}, Watcher()):
         model(scene())
     with torch.enable_grad():
         assert model(scene()).gaussians.means.requires_grad

@@ -86,7 +86,7 @@ def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
 def work_through(sweep: Path, count: int, barrier) -> None:
     """One of several processes that work on the same grid, run by run."""
     job_module.in_sweep = lambda: True
-    job_module._waits = lambda: False
+    job_module._must_wait = lambda: False
     items = plan_seeds(sweep, count)
 
     def slow(run, directory, stats):

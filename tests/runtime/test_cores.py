@@ -44,5 +44,5 @@ def test_one_process_of_a_machine_spins_where_nothing_else_runs(monkeypatch, tmp
     cores.spin_if_alone(["ghgs", "train"], idle)
     assert os.environ == {}
     os.environ["GOMP_SPINCOUNT"] = "20000"
-    cores.children_sleep()
+    cores.let_children_sleep()
     assert os.environ == {}

@@ -21,7 +21,7 @@ from tests.helpers.training import loader, module, trainer
 def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     """The log of a batch job and train.log show the step, loss, steps per second, remaining time and
     validation."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
+    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.is_due", lambda _: True)
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     lines = (tmp_path / "train.log").read_text().splitlines()
     assert len(lines) == 12
@@ -35,7 +35,7 @@ def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
 def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
     """A terminal shows the bar, wrapped if narrow, and train.log gets the lines."""
     monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
-    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
+    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.is_due", lambda _: True)
     monkeypatch.setattr("rich.console.Console.size", ConsoleDimensions(width, 25))
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     shown = " ".join(capsys.readouterr().out.split())
@@ -66,7 +66,7 @@ def test_the_lines_come_once_a_minute(monkeypatch):
     now = iter([0.0, 0.0, 30.0, 60.0, 90.0, 125.0])
     monkeypatch.setattr("ghgs_lit.runs.progress.time.monotonic", lambda: next(now))
     lines = Lines()
-    assert [lines.due() for _ in range(5)] == [True, False, True, False, True]
+    assert [lines.is_due() for _ in range(5)] == [True, False, True, False, True]
 
 
 def test_evaluation_says_how_far_it_is(capsys):

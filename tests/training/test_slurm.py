@@ -132,10 +132,10 @@ def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, 
 
     def first(_, directory, stats):
         monkeypatch.setattr(job, "_PATIENCE", 0.0)
-        job.train_beside(place, run, lambda run, *_: seen.append(run.resume))
+        job.join_training(place, run, lambda run, *_: seen.append(run.resume))
         monkeypatch.setenv("SLURM_STEP_ID", "1")
         with pytest.raises(InputError, match="the first process of this training to work in it"):
-            job.train_beside(place, run, lambda *_: seen.append("wrong"))
+            job.join_training(place, run, lambda *_: seen.append("wrong"))
         monkeypatch.setenv("SLURM_STEP_ID", "0")
         (directory / "checkpoints").mkdir(exist_ok=True)
         (directory / "checkpoints" / "last.ckpt").touch()
@@ -146,5 +146,5 @@ def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, 
         with pytest.raises(KeyboardInterrupt):
             job.train_once(place, run, first)
     with pytest.raises(InputError, match="the first process of this training"):
-        job.train_beside(place, run, lambda *_: seen.append("wrong"))
+        job.join_training(place, run, lambda *_: seen.append("wrong"))
     assert seen == [None, str(tmp_path / "checkpoints" / "last.ckpt")]

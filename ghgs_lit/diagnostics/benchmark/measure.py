@@ -24,8 +24,7 @@ from ghgs_lit.ply import ply_bytes
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
-from ghgs_lit.runtime.watching import Stopwatch, Watcher, inside
-from ghgs_lit.runtime.watching import watched as stages_watched
+from ghgs_lit.runtime.watching import Stopwatch, Watcher, watch_block, watch_stages
 from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering
 
 ROUNDS = "rounds"
@@ -61,7 +60,7 @@ def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
         probe: is called when they begin and end.
     """
     names = [*STAGES, *([] if isinstance(model.rounds, NoRounds) else [ROUNDS])]
-    return stages_watched(model, {name: name for name in names} | PARTS, probe)
+    return watch_stages(model, {name: name for name in names} | PARTS, probe)
 
 
 @torch.inference_mode()
@@ -77,9 +76,9 @@ def forward(
         probe: is called when stages, rendering and the whole begin and end; None: nothing is.
     """
     probe = probe or Watcher()
-    with watched(predictor.model, probe), inside(TOTAL, probe):
+    with watched(predictor.model, probe), watch_block(TOTAL, probe):
         prediction = predictor(replace(batch, targets=None))
-        with inside(RENDER, probe):
+        with watch_block(RENDER, probe):
             rendering = renderer(prediction.gaussians, batch.targets.cameras)
     return prediction, rendering
 

@@ -10,7 +10,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.runs import SETTING
 from ghgs_lit.evaluation.tables.variants import Variant
 from ghgs_lit.parsing import read_json
-from ghgs_lit.runs.results import validated
+from ghgs_lit.runs.results import validate
 
 _Text = Annotated[str, Field(min_length=1)]
 _Count = Annotated[int, Field(ge=1)]
@@ -58,7 +58,7 @@ def read_others(path: Path) -> pd.DataFrame:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
-    others = validated(_Others, read_json(path), path.name)
+    others = validate(_Others, read_json(path), path.name)
     rows = pd.DataFrame([row.model_dump() for row in others.rows])
     cell = [*SETTING, "views", "seed"]
     repeated = rows.duplicated([*cell, "subject"])

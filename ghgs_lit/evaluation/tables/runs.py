@@ -23,7 +23,7 @@ from ghgs_lit.evaluation.tables.variants import (
     name_variants,
 )
 from ghgs_lit.parsing import read_yaml
-from ghgs_lit.runs.results import METHOD, read_results, validated
+from ghgs_lit.runs.results import METHOD, read_results, validate
 from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]
@@ -105,7 +105,7 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as trained
     and measured."""
     content = read_results(path)
-    source = validated(_Provenance, content["provenance"], f"{path}: provenance")
+    source = validate(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
     of_evaluation = ("checkpoint", "refine", "refine_cameras", "data", "metrics")
     config = trained | {key: source.config[key] for key in of_evaluation if key in source.config}

@@ -16,7 +16,7 @@ from ghgs_lit.config.keys import (
     ablation_of,
     flatten,
     is_below,
-    is_own_ablation,
+    is_custom_ablation,
     lookup,
     switches_of,
 )
@@ -71,7 +71,7 @@ class Variant:
     @property
     def is_own(self) -> bool:
         """Whether this is a row of a user-defined ablation."""
-        return bool(self.ablation) and is_own_ablation(self.ablation)
+        return bool(self.ablation) and is_custom_ablation(self.ablation)
 
     @property
     def titles(self) -> list[str]:
@@ -139,7 +139,7 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     model += f", compat {compat}" * (compat not in (None, "none"))
     # A user-defined ablation is a row of the model's table, not another model. The paper's ablations
     # find neighbours in 3D or on the image plane.
-    if is_own_ablation(ablation):
+    if is_custom_ablation(ablation):
         if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
             encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
     elif recalibration.get("neighborhood") == "feature":
