@@ -1,5 +1,5 @@
-"""Attention of one token: the weights are those that the recalibration uses;
-where they are drawn."""
+"""Attention of one token: its weights are those of the recalibration, and pictures show them at the right
+patches."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def seen(model, batch):
     ids=lambda o: o[0].split("=")[1],
 )
 def test_the_weights_are_those_of_the_forward(overrides):
-    """The drawn weights reproduce the output of the recalibration."""
+    """The reported weights reproduce the output of the recalibration."""
     model, batch = make_model("skip=none", *overrides).eval(), make_batch(2, 3)
     (tokens, points), output, _ = seen(model, batch)
     block = model.recalibration.block
@@ -62,14 +62,14 @@ def test_the_weights_are_those_of_the_forward(overrides):
 
 
 def test_the_chosen_token_is_of_its_element_and_has_a_point():
-    """The query belongs to its subject, and a place outside the grid is refused."""
+    """The query belongs to its subject, and a position outside the grid is rejected."""
     model, batch = make_model("skip=none").eval(), make_batch(2, 3)
     (tokens, points), _, _ = seen(model, batch)
     for element in range(2):
         query = chosen_token(tokens, points, element)
         assert int(tokens.image[query]) == element * 3
         assert points.tokens_valid[query]
-    # nothing there: the nearest that has a point
+    # no token there: the nearest one with a point
     query = chosen_token(tokens, points, 1, (2, 0, 0))
     assert int(tokens.image[query]) == 5
     with pytest.raises(InputError, match=r"callbacks\.pictures\.token"):
@@ -88,7 +88,7 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
     picture = attention_sheet(dark, tokens, attention)
     scale, gap = 4, 2
     width, height = 70 * scale, 56 * scale
-    # A row for each layer, with consistency and, beside it, for s = 1; captions of one or two lines
+    # A row per layer, with consistency and then for s = 1; captions of one or two lines
     rows = 1 + len(attention.weights)
     captions = len(picture) - rows * (height + gap)
     assert captions in range(16 * rows, 2 * 16 * rows + 1)

@@ -1,4 +1,4 @@
-"""Sheets: what stands in which row."""
+"""Sheets: the content of each row."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from tests.helpers.scenes import make_batch
 
 
 def test_renders_stand_below_the_photographs_where_there_are_no_targets():
-    """Of photographs of one's own, too, the sheet shows what came back of them, and the error."""
+    """Without targets, the sheet shows renders of the inputs and their errors."""
     batch = dataclasses.replace(make_batch(1, 3, 28, 140), depths=None, targets=None)
     renders = batch.images.flip(-1)
     alone, picture = sheet(batch, None), sheet(batch, renders)
@@ -26,7 +26,7 @@ def test_renders_stand_below_the_photographs_where_there_are_no_targets():
 
 
 def test_a_caption_stays_above_its_own_tile():
-    """A long one takes several lines, a word that is too wide is cut; letters grow with tiles."""
+    """Long captions are wrapped, words that are too wide are clipped, and letters scale with tiles."""
     tiles = [np.zeros((20, 100, 3), np.uint8)] * 2
     plain = row(tiles, ["a", ""])
     for caption in ("its mask green, the hull of the other masks red", 40 * "w"):
@@ -40,7 +40,7 @@ def test_a_caption_stays_above_its_own_tile():
 
 
 def test_many_targets_make_no_endless_column():
-    """Sixteen targets: six tiles in a row; a single one: three."""
+    """Sixteen targets take six tiles per row, a single one three."""
     batch = dataclasses.replace(make_batch(1, 3, 28, 140), depths=None)
     for count, rows, tiles in ((1, 1, 3), (16, 8, 6)):
         images = torch.rand(1, count, 3, 28, 140)
