@@ -1,32 +1,54 @@
 """``ghgs benchmark``: measure run time and error of every preset."""
 
 import itertools
-import json
 import math
-import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import lightning.pytorch as L
+import numpy as np
+import pandas as pd
 import torch
 
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
-from ghgs_lit.cli.runtime import announce, output_dir, write_config
+from ghgs_lit.cli.reports import Tables, pivot, print_tables, publish, texts
+from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.keys import is_below, key_of
-from ghgs_lit.diagnostics.benchmark import report
 from ghgs_lit.diagnostics.benchmark.cases import KNOBS, YARDSTICK, Case, cases_of
-from ghgs_lit.diagnostics.benchmark.measure import record_cases
+from ghgs_lit.diagnostics.benchmark.measure import TOTAL, record_cases
+from ghgs_lit.diagnostics.benchmark.report import broken_budgets, rows_of
 from ghgs_lit.diagnostics.machine import in_words, machine_facts
-from ghgs_lit.diagnostics.output import document, print_tables
 from ghgs_lit.errors import InputError
-from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.results import plain, provenance
+from ghgs_lit.runs.results import provenance
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Benchmark
+
+#: Columns and formats of the table of cases, by heading.
+_COLUMNS = {
+    "preset": ("preset", "{}"),
+    "s (quartiles)": ("quartiles", "{}"),
+    "speed-up": ("speed_up", "{:.2f}"),
+    "peak MB": ("peak_mb", "{:.0f}"),
+    "GFLOP": ("gflop", "{:.2f}"),
+    "tokens": ("tokens", "{:.0f}"),
+    "points": ("points", "{:.0f}"),
+    "Gaussians": ("gaussians", "{:.0f}"),
+    "PLY MB": ("ply_mb", "{:.2f}"),
+    "max rel diff": ("max_rel_diff", "{:.1e}"),
+    "over condition": ("rel_diff", "{:.1e}"),
+    "PSNR": ("psnr", "{:.2f}"),
+    "loss dB": ("psnr_loss_db", "{:+.3f}"),
+    "psnr_box": ("psnr_box", "{:.2f}"),
+    "ssim": ("ssim", "{:.4f}"),
+    "flip": ("flip", "{:.4f}"),
+    "depth_error_mm": ("depth_error_mm", "{:.1f}"),
+    "budget dB": ("budget_db", "{:.3f}"),
+    "budget": ("budget", "{}"),
+}
 
 #: Nodes of :data:`KNOBS` that may be set next to a checkpoint, which brings its own model.
 _APPLIED = ("skip", "renderer", "precision")
@@ -58,10 +80,10 @@ def run(verb: "Benchmark") -> None:
     if batches[0].targets is None:
         raise InputError(f"targets={verb.targets.name}: expected target photographs; found none")
     records = record_cases(cases, batches, verb.metrics.build().to(device), device, verb.timing.repeats)
-    rows = report.rows_of(records)
-    broken = list(itertools.chain.from_iterable(map(report.broken_budgets, report.totals(rows))))
+    rows = rows_of(records)
+    broken = {row["preset"]: broken_budgets(row) for row in rows if row["stage"] == TOTAL}
+    failures = [f"{preset}: {reason}" for preset, reasons in broken.items() for reason in reasons]
     machine = machine_facts(device)
-    tables = report.tables_of(rows)
     _, views, _, height, width = batches[0].images.shape
     size = sum(p.numel() for p in cases[0].predictor.model.parameters()) / 1e6
     weights = verb.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
@@ -70,28 +92,44 @@ def run(verb: "Benchmark") -> None:
         f"{sum(len(batch.images) for batch in batches)} subjects of {data.dataset.name}, "
         f"{views} views of {height} x {width}"
     )
-    notes = [f"Machine: {in_words(machine)}.", about]
+    notes = ["Benchmark", f"Machine: {in_words(machine)}.", about]
     if verb.checkpoint is None:
         notes.append("The weights are random: only run times and differences are meaningful, not PSNR.")
-    notes += [f"Budget broken: {line}." for line in broken]
+    notes += [f"Budget broken: {line}." for line in failures]
     content = {
         "machine": machine,
         "about": about,
         "random_weights": verb.checkpoint is None,
         "rows": rows,
-        "broken": broken,
-        "subjects": list(itertools.chain.from_iterable(record.metrics for record in records)),
+        "broken": failures,
+        "subjects": [row for record in records for row in record.metrics],
         "provenance": provenance(verb.plain, seed=verb.seed, verb="benchmark", choices=choices()),
     }
+    tables = tables_of(pd.DataFrame(rows), broken)
     print_tables(tables)
-    write_text_atomically(directory / "benchmark.md", document("Benchmark", notes, tables))
-    path = directory / "benchmark.json"
-    write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
-    announce(path)
-    for line in broken:
-        print(f"ghgs benchmark: {line}", file=sys.stderr)
-    if broken:
-        raise SystemExit(1)
+    publish(directory, "benchmark", notes, tables, content, failures)
+
+
+def tables_of(rows: pd.DataFrame, broken: Mapping[str, Sequence[str]]) -> Tables:
+    """Tables of cost and error of cases, and of the seconds of their stages.
+
+    Args:
+        rows: of :func:`ghgs_lit.diagnostics.benchmark.report.rows_of`.
+        broken: why a case exceeds its budgets, by its label.
+    """
+    whole = rows[rows.stage == TOTAL]
+    has_budget = whole.max_rel_diff_budget.notna() | (whole.trained.astype(bool) & whole.budget_db.notna())
+    times = whole[["seconds", "seconds_low", "seconds_high"]].itertuples(index=False)
+    cases = whole.assign(
+        quartiles=["{:.3f} ({:.3f} to {:.3f})".format(*quartiles) for quartiles in times],
+        speed_up=whole.seconds.iloc[0] / whole.seconds,
+        peak_mb=whole.peak_bytes.astype(float) / 1e6,
+        gflop=whole.flops.astype(float) / 1e9,
+        ply_mb=whole.ply_bytes / 1e6,
+        budget=np.select([whole.preset.map(broken).astype(bool), has_budget], ["broken", "kept"], "-"),
+    )
+    stages = pivot(rows, "preset", "stage", "seconds", "{:.4f}")
+    return {"Presets": texts(cases, _COLUMNS), "Seconds by stage": stages}
 
 
 def check_options(run: "Benchmark", given: Sequence[str]) -> None:
@@ -114,17 +152,17 @@ def configured_cases(run: "Benchmark", device: torch.device) -> list[Case]:
     """The model in every preset, always including the yardstick.
 
     Args:
-        run: as configured.
+        run: its configuration.
         device: where the models are.
 
     Raises:
         FileNotFoundError: there is no such checkpoint.
         InputError: a preset or knob does not exist, or the weights do not fit it.
     """
-    config = run.plain
     names = dict.fromkeys([YARDSTICK, *run.presets])
     presets = read_options("skip", list(names), run, "presets")
-    path = run.checkpoint
-    of_model = config if path is None else read_config(path)
-    of_model = {**of_model, "renderer": config["renderer"], "precision": config["precision"]}
-    return cases_of(of_model, path, presets, config["knobs"] or {}, device, run.seed)
+    config = run.plain
+    if run.checkpoint is not None:
+        applied = {key: config[key] for key in ("renderer", "precision")}
+        config = {**read_config(run.checkpoint), **applied}
+    return cases_of(config, run.checkpoint, presets, run.knobs or {}, device, run.seed)

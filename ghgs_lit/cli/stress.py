@@ -1,12 +1,9 @@
 """``ghgs stress``: compare stages with float64 on adversarial inputs."""
 
 import itertools
-import json
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,13 +11,12 @@ import pandas as pd
 import torch
 
 from ghgs_lit.cli.inputs import choices
-from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.diagnostics.output import document, pivoted, print_tables
+from ghgs_lit.cli.reports import pivot, print_tables, publish
+from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
 from ghgs_lit.errors import require, require_choice
-from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import provenance
 from ghgs_lit.runtime.cores import allowed_cores
@@ -35,7 +31,7 @@ def run(verb: "Stress") -> None:
     """Compare stages with float64 and write ``stress.md`` and ``stress.json``.
 
     Args:
-        verb: the run.
+        verb: the configuration of the run.
 
     Raises:
         InputError: there is no such stage or family.
@@ -47,30 +43,18 @@ def run(verb: "Stress") -> None:
     require(bool(tasks), "families", "a family that one of the stages has", verb.families)
     rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)
     cells = pd.DataFrame(rows)
-    tables = {"Worst error, in units of eps times the condition number": worst_errors(cells)}
-    summary = f"{cells.cases.sum()} cases, {cells.failures.sum()} failures"
-    print_tables(tables)
-    print(summary)
-    reasons = [(name, STAGES[name].reason) for name in cells.stage.unique()]
-    inputs = [(name, FAMILIES[name].text) for name in cells.family.unique()]
-    tables["Budgets"] = pd.DataFrame(reasons, columns=["stage", "reason"])
-    tables["Families"] = pd.DataFrame(inputs, columns=["family", "inputs"])
-    write_text_atomically(directory / "stress.md", document("Stress test", [f"{summary}."], tables))
     content = {"cases": int(cells.cases.sum()), "failures": int(cells.failures.sum()), "cells": rows}
     content["provenance"] = provenance(verb.plain, seed=0, verb="stress", choices=choices())
-    path = directory / "stress.json"
-    write_text_atomically(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
-    announce(path)
-    for row in filter(itemgetter("failures"), rows):
-        error = "no bound" if row["error"] is None else f"{row['error']:.3g}"
-        print(
-            f"ghgs stress: {row['stage']}, {row['family']}, {row['dtype']}: expected an error of at most"
-            f" {row['budget']:g}; found {error} in {row['failures']} of {row['cases']} cases"
-            f" ({row['worst']})",
-            file=sys.stderr,
-        )
-    if content["failures"]:
-        raise SystemExit(1)
+    tables = {"Worst error, in units of eps times the condition number": worst_errors(cells)}
+    summary = "{cases} cases, {failures} failures".format_map(content)
+    print_tables(tables)
+    print(summary)
+    budgets = {name: STAGES[name].reason for name in cells.stage.unique()}
+    inputs = {name: FAMILIES[name].text for name in cells.family.unique()}
+    tables["Budgets"] = pd.DataFrame(budgets.items(), columns=["stage", "reason"])
+    tables["Families"] = pd.DataFrame(inputs.items(), columns=["family", "inputs"])
+    failures = [failure(row) for row in rows if row["failures"]]
+    publish(directory, "stress", ["Stress test", f"{summary}."], tables, content, failures)
 
 
 def tasks_of(
@@ -129,7 +113,15 @@ def worst_errors(cells: pd.DataFrame) -> pd.DataFrame:
     """Worst error of each stage and dtype, next to its cases and its budget."""
     cells = cells.assign(error=cells.error.astype(float).fillna(np.inf))
     worst = cells.groupby(["stage", "dtype"], sort=False).error.max().reset_index()
-    table = pivoted(worst, "stage", "dtype", "error", "{:.3g}").replace("inf", "no bound")
+    table = pivot(worst, "stage", "dtype", "error", "{:.3g}").replace("inf", "no bound")
     table.insert(1, "cases", list(cells.groupby("stage", sort=False).cases.sum()))
     table.insert(2, "budget", [f"{STAGES[name].factor:g}" for name in table.stage])
     return table
+
+
+def failure(row: Row) -> str:
+    """A line about a cell with failures."""
+    error = "no bound" if row["error"] is None else f"{row['error']:.3g}"
+    found = f"{error} in {row['failures']} of {row['cases']} cases ({row['worst']})"
+    place = f"{row['stage']}, {row['family']}, {row['dtype']}"
+    return f"{place}: expected an error of at most {row['budget']:g}; found {found}"

@@ -40,10 +40,6 @@ class Case:
         """Unique name of the case."""
         return " ".join([self.preset, *(f"{key}={value}" for key, value in self.knobs.items())])
 
-    @property
-    def is_yardstick(self) -> bool:
-        return self.label == YARDSTICK
-
 
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     """All combinations of values of the knobs.

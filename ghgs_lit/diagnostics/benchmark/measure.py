@@ -222,15 +222,15 @@ class Record:
 
     Attributes:
         case: what was measured.
-        works: cost of each batch, from :func:`inspect`.
-        differences: from the yardstick, the worst over batches.
+        costs: of each batch, from :func:`inspect`.
+        changes: differences from the yardstick for each batch.
         metrics: rows of errors against the truth.
         seconds: of each round that counts, by stage.
     """
 
     case: Case
-    works: list[dict[str, float]] = field(default_factory=list)
-    differences: dict[str, float] = field(default_factory=dict)
+    costs: list[dict[str, float]] = field(default_factory=list)
+    changes: list[dict[str, float]] = field(default_factory=list)
     metrics: list[Row] = field(default_factory=list)
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
@@ -321,16 +321,13 @@ def record_cases(
     records = [Record(case) for case in cases]
     for batch in track(batches, "errors"):
         for record in records:
-            work, result = inspect(record.case, batch, device)
-            record.works.append(work)
-            if record.case.is_yardstick:
+            cost, result = inspect(record.case, batch, device)
+            if record is records[0]:
                 yardstick = result
                 condition = amplification(record.case, batch, result)
             change = differences(result, yardstick, batch.masks)
-            change["rel_diff"] = conditioned(result, yardstick, batch, condition)
-            for name, value in change.items():
-                worst = min if name == "psnr_to_none" else max
-                record.differences[name] = worst(record.differences.get(name, value), value)
+            record.costs.append(cost)
+            record.changes.append(change | {"rel_diff": conditioned(result, yardstick, batch, condition)})
             # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
             prediction, rendering = result
             estimate = Estimate(rendering.image, prediction.depth, prediction.depth_valid)

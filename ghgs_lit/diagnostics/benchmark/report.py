@@ -1,4 +1,4 @@
-"""Rows, budgets and tables of a benchmark."""
+"""Rows and budgets of a benchmark."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 
 from ghgs_lit.diagnostics.benchmark.measure import TOTAL, Record
-from ghgs_lit.diagnostics.output import Tables, pivoted, texts
 from ghgs_lit.runs.results import Row, summarize
 
 #: Metrics besides PSNR in the row ``total`` of a case, if known.
@@ -16,51 +15,29 @@ ERRORS = (
     "sharpness", "depth_error_mm",
 )  # fmt: skip
 
-#: Columns and formats of the table of cases, by heading.
-_COLUMNS = {
-    "preset": ("preset", "{}"),
-    "s (quartiles)": ("quartiles", "{}"),
-    "speed-up": ("speed_up", "{:.2f}"),
-    "peak MB": ("peak_mb", "{:.0f}"),
-    "GFLOP": ("gflop", "{:.2f}"),
-    "tokens": ("tokens", "{:.0f}"),
-    "points": ("points", "{:.0f}"),
-    "Gaussians": ("gaussians", "{:.0f}"),
-    "PLY MB": ("ply_mb", "{:.2f}"),
-    "max rel diff": ("max_rel_diff", "{:.1e}"),
-    "over condition": ("rel_diff", "{:.1e}"),
-    "PSNR": ("psnr", "{:.2f}"),
-    "loss dB": ("psnr_loss_db", "{:+.3f}"),
-    "psnr_box": ("psnr_box", "{:.2f}"),
-    "ssim": ("ssim", "{:.4f}"),
-    "flip": ("flip", "{:.4f}"),
-    "depth_error_mm": ("depth_error_mm", "{:.1f}"),
-    "budget dB": ("budget_db", "{:.3f}"),
-    "budget": ("budget", "{}"),
-}
-
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
     """Rows of the tables and of ``benchmark.json``: one for each case (the yardstick first) and stage; row
     ``total`` also has errors and budgets."""
     rows: list[Row] = []
+    psnr_of_none = summarize(records[0].metrics)[0]["psnr"]
     for record in records:
         (means,) = summarize(record.metrics)
-        if record.case.is_yardstick:
-            psnr_of_none = means["psnr"]
-        works = pd.DataFrame(record.works)
+        costs = pd.DataFrame(record.costs)
+        changes = pd.DataFrame(record.changes)
+        worst = changes.max(skipna=False).to_dict() | {"psnr_to_none": changes.psnr_to_none.min()}
         total = {
-            **works.mean().to_dict(),
-            "peak_bytes": float(works.peak_bytes.max()),
-            **{name: record.differences[name] for name in ("max_rel_diff", "rel_diff")},
+            **costs.mean().to_dict(),
+            "peak_bytes": float(costs.peak_bytes.max()),
+            **{name: worst[name] for name in ("max_rel_diff", "rel_diff")},
             "psnr": means["psnr"],
             "psnr_loss_db": psnr_of_none - means["psnr"],
-            "difference_db": difference_db(record.differences["mse_to_none"], psnr_of_none),
+            "difference_db": difference_db(worst["mse_to_none"], psnr_of_none),
             "budget_db": record.case.budget_db,
             "max_rel_diff_budget": record.case.max_rel_diff,
             "trained": record.case.is_trained,
             **{name: means[name] for name in ERRORS if name in means},
-            "differences": record.differences,
+            "differences": worst,
         }
         for stage, seconds in record.seconds.items():
             low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
@@ -100,27 +77,4 @@ def broken_budgets(row: Row) -> list[str]:
     limit = row["budget_db"]
     if row["trained"] and limit is not None and not loss <= limit:
         lines.append(f"expected a loss up to {limit:g} dB of PSNR; found {loss:.3g}")
-    return [f"{row['preset']}: {line}" for line in lines]
-
-
-def totals(rows: Sequence[Row]) -> list[Row]:
-    """Rows of whole cases."""
-    return [row for row in rows if row["stage"] == TOTAL]
-
-
-def tables_of(rows: Sequence[Row]) -> Tables:
-    """Tables of cost and error of cases, and of the seconds of their stages."""
-    whole = pd.DataFrame(totals(rows))
-    promises = whole.max_rel_diff_budget.notna() | (whole.trained & whole.budget_db.notna())
-    is_broken = np.array([bool(broken_budgets(row)) for row in totals(rows)])
-    times = whole[["seconds", "seconds_low", "seconds_high"]].itertuples(index=False)
-    cases = whole.assign(
-        quartiles=["{:.3f} ({:.3f} to {:.3f})".format(*quartiles) for quartiles in times],
-        speed_up=whole.seconds.iloc[0] / whole.seconds,
-        peak_mb=whole.peak_bytes.astype(float) / 1e6,
-        gflop=whole.flops.astype(float) / 1e9,
-        ply_mb=whole.ply_bytes / 1e6,
-        budget=np.select([is_broken, promises], ["broken", "kept"], "-"),
-    )
-    stages = pivoted(pd.DataFrame(rows), "preset", "stage", "seconds", "{:.4f}")
-    return {"Presets": texts(cases, _COLUMNS), "Seconds by stage": stages}
+    return lines

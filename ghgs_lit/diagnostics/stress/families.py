@@ -1,32 +1,28 @@
-"""Families of adversarial inputs, in float64. A family changes one ingredient of a case; the others stay
-ordinary."""
+"""Inputs of the stages in float64: ordinary ones, and families of adversarial ones. A family changes one
+ingredient of a case; the others stay ordinary."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional
 
+from ghgs_lit.geometry.projection import homogeneous_centers, world_to_camera
+from ghgs_lit.types import Batch, Cameras
+
 F64 = torch.float64
 Values = dict[str, Tensor]  #: Inputs or outputs [n, ...] of n cases by their names
-Change = Callable[[Tensor, Generator], Tensor]
 
 
-@dataclass(frozen=True)
-class Family:
-    """A kind of inputs.
+class Family(NamedTuple):
+    """A kind of inputs."""
 
-    Attributes:
-        ingredient: what it changes; None: it applies to every stage.
-        text: describes the inputs.
-        change: makes its values from ordinary ones; None: :func:`rig` and :func:`points` do, by its name.
-    """
-
-    ingredient: str | None
-    text: str
-    change: Change | None = None
+    ingredient: str | None  #: what it changes; None: it applies to every stage
+    text: str  #: describes the inputs
+    change: Callable[[Tensor, Generator], Tensor] | None = None
+    """Makes the ingredient from an ordinary one; None: what makes the inputs looks at the family's name."""
 
 
 def normal(g: Generator, *shape: int) -> Tensor:
@@ -44,51 +40,54 @@ def directions(g: Generator, *shape: int) -> Tensor:
     return functional.normalize(normal(g, *shape), dim=-1)
 
 
-def _times(factor: float | list[float]) -> Change:
-    return lambda values, g: values * torch.tensor(factor, dtype=F64)
+def _column(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=F64)[:, None]
 
 
-def _all(number: float) -> Change:
-    return lambda values, g: torch.full_like(values, number)
+def _ring(x: Tensor, g: Generator) -> Tensor:
+    angles = uniform(g, 0, 2 * math.pi, len(x))
+    across = uniform(g, 0.7, 1.2, len(x))
+    points = torch.stack((across * angles.cos(), across * angles.sin(), torch.ones_like(across)), 1)
+    return uniform(g, 0.7, 1.5, len(x), 1) * points
 
 
-def _large(factor: float) -> Change:
-    return lambda values, g: values.sign() * factor * uniform(g, 0.5, 1.5, *values.shape)
+def _behind(x: Tensor, g: Generator) -> Tensor:
+    return torch.cat((0.1 * normal(g, len(x), 2), -uniform(g, 0.1, 3, len(x), 1)), 1)
 
 
-def _last_mask(change: Change) -> Change:
+def _on_camera(x: Tensor, g: Generator) -> Tensor:
+    return 1e-6 * torch.cat((0.2 * normal(g, len(x), 2), uniform(g, 0.5, 1, len(x), 1)), 1)
+
+
+def _not_orthogonal(x: Tensor, g: Generator) -> Tensor:
+    return x + 1e-3 * normal(g, *x.shape)
+
+
+def _alternating(x: Tensor, g: Generator) -> Tensor:
+    return x[:1] * (1 - 2 * (torch.arange(len(x)) % 2))[:, None]
+
+
+def _large(factor: float) -> Callable[[Tensor, Generator], Tensor]:
+    return lambda x, g: x.sign() * factor * uniform(g, 0.5, 1.5, *x.shape)
+
+
+def _last_mask(change: Callable[[Tensor, Generator], Tensor]) -> Callable[[Tensor, Generator], Tensor]:
     """Changes the mask of the last view of masks [v, h, w]."""
-    return lambda masks, g: torch.cat((masks[:-1], change(masks[-1:], g).bool()))
+    return lambda x, g: torch.cat((x[:-1], change(x[-1:], g)))
 
 
-def _first(values: Tensor, g: Generator) -> Tensor:
-    return values[:1].expand_as(values).clone()
+def _one_pixel(x: Tensor, g: Generator) -> Tensor:
+    pixels = torch.arange(x.numel()).view_as(x)
+    return pixels == torch.randint(x.numel(), (), generator=g)
 
 
-def _alternating(values: Tensor, g: Generator) -> Tensor:
-    return values[:1] * (1 - 2 * (torch.arange(len(values)) % 2))[:, None]
+def _noise(x: Tensor, g: Generator) -> Tensor:
+    return torch.rand(x.shape, generator=g) < 0.3
 
 
-def _twice(values: Tensor, g: Generator) -> Tensor:
-    return values[torch.arange(len(values)) // 2]
-
-
-def _one_pixel(masks: Tensor, g: Generator) -> Tensor:
-    pixels = torch.arange(masks.numel()).view_as(masks)
-    return pixels == torch.randint(masks.numel(), (), generator=g)
-
-
-def _noise(masks: Tensor, g: Generator) -> Tensor:
-    return torch.rand(masks.shape, generator=g) < 0.3
-
-
-def _one_color(images: Tensor, g: Generator) -> Tensor:
-    return torch.full_like(images, float(images.flatten()[0]))
-
-
-def _upper_half(masks: Tensor, g: Generator) -> Tensor:
-    rows = torch.arange(masks.shape[1])[:, None]
-    return masks & (rows < masks.shape[1] // 2)
+def _upper_half(x: Tensor, g: Generator) -> Tensor:
+    rows = torch.arange(x.shape[1])[:, None]
+    return x & (rows < len(rows) // 2)
 
 
 FAMILIES = {
@@ -100,45 +99,45 @@ FAMILIES = {
     "small": Family("place", "a scene in kilometres"),
     "wide": Family("cameras", "focal lengths of a fisheye, 0.1 of the image"),
     "long": Family("cameras", "focal lengths of 1e5 px, the camera as far away"),
-    "skewed": Family("cameras", "rotations that are orthogonal to 1e-3 only"),
-    "mirrored": Family("cameras", "extrinsics with a determinant of -1"),
-    "degenerate": Family("cameras", "rotations of rank 2"),
-    "zero_depth": Family("depths", "depths of 0", _times(0.0)),
-    "negative_depth": Family("depths", "depths below 0", _times(-1.0)),
-    "near_zero_depth": Family("depths", "depths of 1e-12", _times(1e-12)),
-    "huge_depth": Family("depths", "depths of 1e12", _times(1e12)),
-    "equal_depths": Family("depths", "all depths equal", _all(2.0)),
-    "behind": Family("points seen", "points behind the camera"),
-    "on_camera": Family("points seen", "points 1e-6 from the camera's centre"),
-    "beside": Family("points seen", "points beside the frame, whose splats reach into it"),
-    "far": Family("points", "points 1e6 m away", lambda points, g: points + 1e6 * directions(g, 1, 3)),
-    "duplicates": Family("points", "all points twice", _twice),
-    "collapsed": Family("points", "all points at one place", _first),
+    "skewed": Family("cameras", "rotations orthogonal to 1e-3 only", _not_orthogonal),
+    "mirrored": Family("cameras", "extrinsics with a determinant of -1", lambda x, g: x * _column(-1, 1, 1)),
+    "degenerate": Family("cameras", "rotations of rank 2", lambda x, g: x[:, [1, 1, 2]]),
+    "zero_depth": Family("depths", "depths of 0", lambda x, g: 0 * x),
+    "negative_depth": Family("depths", "depths below 0", lambda x, g: -x),
+    "near_zero_depth": Family("depths", "depths of 1e-12", lambda x, g: 1e-12 * x),
+    "huge_depth": Family("depths", "depths of 1e12", lambda x, g: 1e12 * x),
+    "equal_depths": Family("depths", "all depths equal", lambda x, g: torch.full_like(x, 2)),
+    "behind": Family("points seen", "points behind the camera", _behind),
+    "on_camera": Family("points seen", "points 1e-6 from the camera's centre", _on_camera),
+    "beside": Family("points seen", "points beside the frame, whose splats reach into it", _ring),
+    "far": Family("points", "points 1e6 m away", lambda x, g: x + 1e6 * directions(g, 1, 3)),
+    "duplicates": Family("points", "all points twice", lambda x, g: x[torch.arange(len(x)) // 2]),
+    "collapsed": Family("points", "all points at one place", lambda x, g: x[:1].repeat(len(x), 1)),
     "few": Family("neighbors", "fewer points than k"),
     "single": Family("neighbors", "one point"),
-    "zero_quaternion": Family("quaternions", "quaternions of 0", _times(0.0)),
-    "tiny_quaternion": Family("quaternions", "quaternions of length 1e-20", _times(1e-20)),
-    "huge_quaternion": Family("quaternions", "quaternions of length 1e20", _times(1e20)),
-    "zero_scale": Family("scales", "scales of 0", _times(0.0)),
-    "tiny_scale": Family("scales", "scales of 1e-12", _all(1e-12)),
-    "huge_scale": Family("scales", "scales of 1e4 m", _all(1e4)),
-    "thin": Family("scales", "scales with an aspect of 1e6", _times([1.0, 1e-6, 1e-6])),
-    "transparent": Family("opacities", "opacities of 0", _all(0.0)),
-    "opaque": Family("opacities", "opacities of 1", _all(1.0)),
+    "zero_quaternion": Family("quaternions", "quaternions of 0", lambda x, g: 0 * x),
+    "tiny_quaternion": Family("quaternions", "quaternions of length 1e-20", lambda x, g: 1e-20 * x),
+    "huge_quaternion": Family("quaternions", "quaternions of length 1e20", lambda x, g: 1e20 * x),
+    "zero_scale": Family("scales", "scales of 0", lambda x, g: 0 * x),
+    "tiny_scale": Family("scales", "scales of 1e-12", lambda x, g: torch.full_like(x, 1e-12)),
+    "huge_scale": Family("scales", "scales of 1e4 m", lambda x, g: torch.full_like(x, 1e4)),
+    "thin": Family("scales", "scales with an aspect of 1e6", lambda x, g: x * _column(1, 1e-6, 1e-6).T),
+    "transparent": Family("opacities", "opacities of 0", lambda x, g: torch.zeros_like(x)),
+    "opaque": Family("opacities", "opacities of 1", lambda x, g: torch.ones_like(x)),
     "stacked": Family("stacks", "thousands of splats on one line of sight"),
-    "zero_features": Family("features", "features of 0", _times(0.0)),
-    "tiny_features": Family("features", "features of length 1e-20", _times(1e-20)),
-    "huge_features": Family("features", "features of length 1e18", _times(1e18)),
-    "parallel_features": Family("features", "all features equal", _first),
+    "zero_features": Family("features", "features of 0", lambda x, g: 0 * x),
+    "tiny_features": Family("features", "features of length 1e-20", lambda x, g: 1e-20 * x),
+    "huge_features": Family("features", "features of length 1e18", lambda x, g: 1e18 * x),
+    "parallel_features": Family("features", "all features equal", lambda x, g: x[:1].repeat(len(x), 1)),
     "opposite_features": Family("features", "pairs of opposite features", _alternating),
-    "large_logits": Family("queries", "queries, keys 30 times as large as after a LayerNorm", _times(30.0)),
+    "large_logits": Family("queries", "queries and keys 30 times those of a LayerNorm", lambda x, g: 30 * x),
     "saturated": Family("raw values", "raw values of +-100", _large(100.0)),
     "extreme": Family("raw values", "raw values of +-1e4", _large(1e4)),
-    "constant": Family("images", "images of one colour", _one_color),
-    "black": Family("images", "black images", _times(0.0)),
+    "constant": Family("images", "images of one colour", lambda x, g: x.flatten()[:1].expand(x.shape)),
+    "black": Family("images", "black images", lambda x, g: 0 * x),
     "identical": Family("images", "image and target are equal"),
-    "out_of_range": Family("images", "colours from -10 to 10", lambda images, g: 20 * images - 10),
-    "empty_mask": Family("masks", "a view without the subject", _last_mask(_times(0.0))),
+    "out_of_range": Family("images", "colours from -10 to 10", lambda x, g: 20 * x - 10),
+    "empty_mask": Family("masks", "a view without the subject", _last_mask(lambda x, g: torch.zeros_like(x))),
     "one_pixel": Family("masks", "a mask of one pixel", _last_mask(_one_pixel)),
     "noise_mask": Family("masks", "a mask of noise", _last_mask(_noise)),
     "wrong_mask": Family("masks", "one mask half cut off", _last_mask(_upper_half)),
@@ -150,18 +149,17 @@ COUNTS = {"few": 4, "single": 1}  #: Numbers of points by family
 
 
 def vary(ingredient: str, family: str, ordinary: Tensor, g: Generator) -> Tensor:
-    """Values of an ingredient.
+    """Values of an ingredient, changed if the family is one of this ingredient.
 
     Args:
         ingredient: of which ``ordinary`` is.
-        family: changes the values if it is one of this ingredient.
+        family: of the case.
         ordinary: values as in training.
-        g: source of further numbers.
+        g: source of further random numbers.
     """
     chosen = FAMILIES[family]
-    if chosen.ingredient != ingredient or chosen.change is None:
-        return ordinary
-    return chosen.change(ordinary, g)
+    is_changed = chosen.ingredient == ingredient and chosen.change is not None
+    return chosen.change(ordinary, g) if is_changed else ordinary
 
 
 def depths(family: str, g: Generator, *shape: int) -> Tensor:
@@ -174,7 +172,7 @@ def rig(family: str, g: Generator, views: int, size: int) -> Values:
 
     Args:
         family: of the case.
-        g: source of the numbers.
+        g: source of random numbers.
         views: number of cameras.
         size: side of the images in pixels.
 
@@ -186,22 +184,20 @@ def rig(family: str, g: Generator, views: int, size: int) -> Values:
     middle = directions(g, 3) * (1e4 if family == "shifted" else 0.1) * unit
     focal = {"wide": 0.1 * size, "long": 1e5}.get(family, float(uniform(g, 0.8, 1.2)) * size)
     distance = 2.0 * unit * (focal / size if family == "long" else 1.0)
-    lenses = torch.empty(views, 4, dtype=F64)
-    lenses[:, 0] = focal
-    lenses[:, 1] = 1.03 * focal
-    lenses[:, 2:] = size / 2 + uniform(g, -0.5, 0.5, views, 2)
+    centers = size / 2 + uniform(g, -0.5, 0.5, views, 2)
+    lenses = torch.cat((_column(focal, 1.03 * focal).T.expand(views, 2), centers), 1)
     angles = uniform(g, 0, 2 * math.pi, 1) + 2 * math.pi * torch.arange(views) / views
     forward = -functional.normalize(torch.stack((angles.sin(), angles * 0 + 0.2, angles.cos()), 1))
-    right = functional.normalize(torch.linalg.cross(forward, torch.tensor([[0.0, 1.0, 0.0]], dtype=F64)))
-    rotations = torch.stack((right, torch.linalg.cross(forward, right), forward), 1)
-    if family == "skewed":
-        rotations = rotations + 1e-3 * normal(g, views, 3, 3)
-    if family == "mirrored":
-        rotations = rotations * torch.tensor([[-1.0], [1.0], [1.0]], dtype=F64)
-    if family == "degenerate":
-        rotations = rotations[:, [1, 1, 2]]
-    shifts = -rotations @ middle + torch.tensor([0.0, 0.0, distance], dtype=F64)
-    return {"lenses": lenses, "poses": torch.cat((rotations, shifts[..., None]), 2), "middle": middle}
+    right = functional.normalize(torch.linalg.cross(forward, _column(0, 1, 0).T))
+    upright = torch.stack((right, torch.linalg.cross(forward, right), forward), 1)
+    rotations = vary("cameras", family, upright, g)
+    shifts = _column(0, 0, distance) - (rotations @ middle)[..., None]
+    return {"lenses": lenses, "poses": torch.cat((rotations, shifts), 2), "middle": middle}
+
+
+def _square(rows: Tensor) -> Tensor:
+    last = torch.eye(rows.shape[-1], dtype=rows.dtype)[-1:]
+    return torch.cat((rows, last.expand(*rows.shape[:-2], 1, -1)), -2)
 
 
 def matrices(v: Values, prefix: str = "") -> tuple[Tensor, Tensor]:
@@ -211,44 +207,37 @@ def matrices(v: Values, prefix: str = "") -> tuple[Tensor, Tensor]:
         v: ``lenses`` and ``poses``.
         prefix: of these names.
     """
-    lenses = v[f"{prefix}lenses"]
-    poses = v[f"{prefix}poses"]
-    focal, center = lenses.split(2, -1)
-    last = torch.tensor([[0.0, 0.0, 1.0]], dtype=lenses.dtype).expand(*lenses.shape[:-1], 1, 3)
-    intrinsics = torch.cat((torch.cat((focal.diag_embed(), center[..., None]), -1), last), -2)
-    last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=poses.dtype).expand(*poses.shape[:-2], 1, 4)
-    return intrinsics, torch.cat((poses, last), -2)
+    focal, center = v[f"{prefix}lenses"].split(2, -1)
+    intrinsics = torch.cat((focal.diag_embed(), center[..., None]), -1)
+    return _square(intrinsics), _square(v[f"{prefix}poses"])
 
 
-def _ring(g: Generator, count: int) -> Tensor:
-    angles = uniform(g, 0, 2 * math.pi, count)
-    across = uniform(g, 0.7, 1.2, count)
-    points = torch.stack((across * angles.cos(), across * angles.sin(), torch.ones(count, dtype=F64)), 1)
-    return uniform(g, 0.7, 1.5, count, 1) * points
-
-
-#: Points in the axes of a camera, by family.
-_SEEN = {
-    "behind": lambda g, n: torch.cat((0.1 * normal(g, n, 2), -uniform(g, 0.1, 3, n, 1)), 1),
-    "on_camera": lambda g, n: 1e-6 * torch.cat((0.2 * normal(g, n, 2), uniform(g, 0.5, 1, n, 1)), 1),
-    "beside": _ring,
-}
+def cameras_of(v: Values, size: int, prefix: str = "") -> Cameras:
+    """Cameras of :func:`rig` for square images of a size."""
+    return Cameras(*matrices(v, prefix), size, size)
 
 
 def points(family: str, g: Generator, count: int, scene: Values) -> Tensor:
-    """World points [count, 3] around the middle of a scene, or where its first camera has them.
+    """World points [count, 3] around the middle of a scene, or at a place before its first camera.
 
     Args:
         family: of the case.
-        g: source of the numbers.
+        g: source of random numbers.
         count: number of points.
         scene: of :func:`rig`.
     """
-    if family in _SEEN:
+    if FAMILIES[family].ingredient == "points seen":
         pose = scene["poses"][0]
-        return (_SEEN[family](g, count) - pose[:, 3]) @ pose[:, :3]
+        in_camera = FAMILIES[family].change(torch.empty(count, 3), g)
+        return (in_camera - pose[:, 3]) @ pose[:, :3]
     around = scene["middle"] + 0.3 * UNITS.get(family, 1.0) * normal(g, count, 3)
     return vary("points", family, around, g)
+
+
+def scene_points(family: str, g: Generator) -> Values:
+    """A camera for 16 x 16 pixels, and ``points`` before it."""
+    scene = rig(family, g, 1, 16)
+    return {**scene, "points": points(family, g, COUNTS.get(family, 20), scene)}
 
 
 def sphere(family: str, g: Generator, views: int, size: int, target: bool = False) -> Values:
@@ -256,7 +245,7 @@ def sphere(family: str, g: Generator, views: int, size: int, target: bool = Fals
 
     Args:
         family: of the case.
-        g: source of the numbers.
+        g: source of random numbers.
         views: number v of input views.
         size: side s of the images in pixels.
         target: whether there is a target view, too.
@@ -267,11 +256,10 @@ def sphere(family: str, g: Generator, views: int, size: int, target: bool = Fals
         ``target_lenses`` and ``target_poses``.
     """
     scene = rig(family, g, views + target, size)
-    intrinsics, extrinsics = matrices(scene)
-    centers = torch.arange(size, dtype=F64) + 0.5
-    pixels = torch.cartesian_prod(centers, centers).view(size, size, 2).flip(-1)
-    rays = functional.pad(pixels, (0, 1), value=1.0) @ torch.linalg.inv(intrinsics).mT[:, None]
-    center = (extrinsics[:, :3, :3] @ scene["middle"] + extrinsics[:, :3, 3])[:, None, None]
+    cameras = cameras_of(scene, size)
+    centers = homogeneous_centers(size, size, cameras.intrinsics)
+    rays = centers @ torch.linalg.inv(cameras.intrinsics).mT[:, None]
+    center = world_to_camera(scene["middle"].expand(views + target, 3), cameras.extrinsics)[:, None, None]
     a = rays.square().sum(-1)
     b = (rays * center).sum(-1)
     root = b * b - a * (center.square().sum(-1) - (0.5 * UNITS.get(family, 1.0)) ** 2)
@@ -287,3 +275,8 @@ def sphere(family: str, g: Generator, views: int, size: int, target: bool = Fals
     if target:
         values["target"] = images[:1] if family == "identical" else images[views:]
     return values
+
+
+def batch_of(v: Values) -> Batch:
+    """Batch of stacked cases of :func:`sphere`, without their targets."""
+    return Batch(v["images"], v["masks"], cameras_of(v, v["images"].shape[-1]))

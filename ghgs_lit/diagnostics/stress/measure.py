@@ -8,14 +8,16 @@ from typing import Any
 
 import torch
 from torch import Generator, Tensor
+from torch.nn.functional import pad
+from torch.utils.data import default_collate
 
-from ghgs_lit.diagnostics.stress.families import FAMILIES, Values
+from ghgs_lit.diagnostics.stress.families import F64, FAMILIES, Values
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import plain
 
 #: Precisions of the runs; the last two are autocast, with inputs in float32.
 DTYPES = ("float32", "bfloat16", "float16")
-#: Families with a value that is not finite, which must be refused or show in the outputs.
+#: Families with a value that is not finite, which must be rejected or be visible in the outputs.
 PLANTED = {"nan": math.nan, "inf": math.inf}
 #: Largest relative difference of gradients in float64 from central differences.
 SLOPES = 1e-3
@@ -26,6 +28,7 @@ _STEP = torch.finfo(torch.float32).eps
 #: largest ``error`` in units of eps times the condition number (None: unbounded); ``budget``, the allowed
 #: factor; ``worst``, the output and seed of the largest error.
 Row = dict[str, Any]
+Errors = tuple[Tensor, list[str]]  #: Errors [n] of n cases in these units, and the output that has each
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,12 @@ class Stage:
         seeds: number of cases of each family and dtype in the full run;
             a quick run misses rare failures.
         is_network: whether the stage computes in autocast's dtype; others compute in float32 or wider.
-        kappa: lower bound of the condition number [n],
+        kappa: lower bound of the condition number [n] (or [1], of all cases),
             where the stage's definition subtracts large numbers.
         sizes: magnitude [n] of terms that cancel in the gradients by definition; where these are
             not unique and must only be finite, the largest number.
         without: families that do not apply although their ingredient does.
-        silent: why a value that is not finite need not show in the outputs; empty: it must.
+        silent: why a value that is not finite need not be visible in the outputs; empty: it must.
     """
 
     name: str
@@ -74,34 +77,29 @@ class Stage:
     @property
     def families(self) -> list[str]:
         """Families that apply."""
-        applying = {None, *self.ingredients}
-        return [
-            name
-            for name, family in FAMILIES.items()
-            if family.ingredient in applying and name not in self.without
-        ]
+        known = (None, *self.ingredients)
+        return [n for n, family in FAMILIES.items() if family.ingredient in known and n not in self.without]
+
+    def rounded(self, cases: Values) -> list[str]:
+        """Names of the inputs that are rounded for kappa, and may get a value that is not finite."""
+        return [n for n, value in cases.items() if value.is_floating_point() and n not in self.steady]
 
 
 def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
     """Turn a function of one case into one of stacked cases."""
 
-    def stacked(values: Values) -> Values:
-        cases = [dict(zip(values, case, strict=True)) for case in zip(*values.values(), strict=True)]
-        return stack([run(case) for case in cases])
+    def run_stacked(values: Values) -> Values:
+        cases = zip(*values.values(), strict=True)
+        return default_collate([run(dict(zip(values, case, strict=True))) for case in cases])
 
-    return stacked
-
-
-def stack(cases: list[Values]) -> Values:
-    """Stack the values of cases, which have the same names and shapes, along a new first axis."""
-    return {name: torch.stack([case[name] for case in cases]) for name in cases[0]}
+    return run_stacked
 
 
 def measure(stage: Stage, family: str, seeds: int, dtypes: Sequence[str] = DTYPES) -> list[Row]:
     """Cells of a stage and family, one for each dtype. What a stage raises is a failure of all its cases."""
     # A case depends on stage, family and seed only.
     keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in range(seeds)]
-    cases = stack([stage.make(family, Generator().manual_seed(key)) for key in keys])
+    cases = default_collate([stage.make(family, Generator().manual_seed(key)) for key in keys])
     # Inputs that all dtypes represent exactly: their rounding is not the stage's error.
     cases = {name: value.float() if value.is_floating_point() else value for name, value in cases.items()}
     try:
@@ -110,10 +108,9 @@ def measure(stage: Stage, family: str, seeds: int, dtypes: Sequence[str] = DTYPE
         else:
             results = _compare(stage, family, cases, dtypes)
     except Exception as error:  # whatever a stage raises is a failure of its own, and the others go on
-        is_refused = family == "out_of_range" and isinstance(error, InputError)
-        errors = torch.full((seeds,), 0.0 if is_refused else math.inf)
+        is_rejected = family == "out_of_range" and isinstance(error, InputError)
         message = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
-        results = [(errors, [message] * seeds)] * len(dtypes)
+        results = [(torch.full((seeds,), 0.0 if is_rejected else math.inf), [message] * seeds)] * len(dtypes)
     rows = []
     for dtype, (errors, places) in zip(dtypes, results, strict=True):
         worst = int(errors.argmax())
@@ -123,56 +120,48 @@ def measure(stage: Stage, family: str, seeds: int, dtypes: Sequence[str] = DTYPE
     return rows
 
 
-def evaluate(stage: Stage, inputs: Values, dtype: str) -> Values:
+def evaluate(stage: Stage, inputs: Values, dtype: str) -> tuple[Values, Tensor]:
     """Run a stage, and differentiate a weighted sum of all its outputs.
 
     Args:
         stage: is run.
-        inputs: [n, ...] by name.
-        dtype: float64 or one of :data:`DTYPES`.
+        inputs: [n, ...] by name, in float32 or float64.
+        dtype: of autocast, if it is one of the last of :data:`DTYPES`.
 
     Returns:
-        Outputs by name, and gradients as ``d <input>``, in float64.
+        Outputs by name, and gradients as ``d <input>``, in float64; and the sums [n].
     """
-    leaves = {}
-    for name, value in inputs.items():
-        value = value.double() if dtype == "float64" and value.is_floating_point() else value
-        leaves[name] = value.detach().requires_grad_(name in stage.gradients)
-    half = getattr(torch, dtype) if dtype in DTYPES[1:] else None
+    leaves = {name: x.detach().requires_grad_(name in stage.gradients) for name, x in inputs.items()}
     with torch.set_grad_enabled(bool(stage.gradients)):
-        with torch.autocast("cpu", half, enabled=half is not None):
+        with torch.autocast("cpu", getattr(torch, dtype), enabled=dtype in DTYPES[1:]):
             outputs = stage.run(leaves)
-        results = {name: value.detach().double() for name, value in outputs.items()}
-        if stage.gradients:
-            total = sum((_weights(name, value) * value.double()).sum() for name, value in outputs.items())
-            wanted = [leaves[name] for name in stage.gradients]
-            slopes = torch.autograd.grad(total, wanted, materialize_grads=True)
-            results |= {
-                f"d {name}": slope.double() for name, slope in zip(stage.gradients, slopes, strict=True)
-            }
-    return results
+        total = sum(_weighted_sum(name, value.double()) for name, value in outputs.items())
+    results = {name: value.detach().double() for name, value in outputs.items()}
+    if stage.gradients:
+        wanted = [leaves[name] for name in stage.gradients]
+        slopes = torch.autograd.grad(total.sum(), wanted, materialize_grads=True)
+        results |= {f"d {name}": slope.double() for name, slope in zip(stage.gradients, slopes, strict=True)}
+    return results, total.detach()
 
 
-def _weights(name: str, value: Tensor) -> Tensor:
-    """Random weights of an output's entries, the same for all cases and dtypes."""
+def _weighted_sum(name: str, value: Tensor) -> Tensor:
+    """Sum [n] of an output's entries with random weights, the same for all cases and dtypes."""
     g = Generator().manual_seed(zlib.crc32(name.encode()))
-    return torch.randn(value.shape[1:], generator=g, dtype=torch.float64)
+    weights = torch.randn(value.shape[1:], generator=g, dtype=F64)
+    return (weights * value).reshape(len(value), -1).sum(1)
 
 
 def _largest(values: Tensor) -> Tensor:
-    """Largest magnitude of each case; infinite where a value is not finite."""
+    """Largest magnitude of each case; infinite where a value is not finite, 0 without values."""
     flat = values.reshape(len(values), -1).abs()
-    flat = torch.where(flat.isfinite(), flat, torch.inf)
-    return flat.amax(1) if flat.shape[1] else flat.new_zeros(len(flat))
+    return pad(flat.nan_to_num(nan=math.inf, posinf=math.inf), (0, 1)).amax(1)
 
 
-def _compare(
-    stage: Stage, family: str, cases: Values, dtypes: Sequence[str]
-) -> list[tuple[Tensor, list[str]]]:
-    """Errors [n] in units of eps times the condition number, and names of what has them, for each dtype."""
+def _compare(stage: Stage, family: str, cases: Values, dtypes: Sequence[str]) -> list[Errors]:
+    """Errors for each dtype."""
     exact = {name: value.double() if value.is_floating_point() else value for name, value in cases.items()}
-    truth = evaluate(stage, exact, "float64")
-    kappa = _condition(stage, exact, truth)
+    truth, _ = evaluate(stage, exact, "float64")
+    kappa = condition(stage, exact, truth)
     names = list(truth)
     slopes = []
     if stage.gradients and family == "ordinary":
@@ -180,7 +169,7 @@ def _compare(
         slopes.append(_slope_errors(stage, exact, truth) / SLOPES * stage.factor)
     results = []
     for dtype in dtypes:
-        values = evaluate(stage, cases, dtype)
+        values, _ = evaluate(stage, cases, dtype)
         eps = torch.finfo(getattr(torch, dtype) if stage.is_network else torch.float32).eps
         floor = torch.finfo(torch.float32).tiny / eps
         ratios = [_largest(values[name] - truth[name]) / (eps * (kappa[name] + floor)) for name in truth]
@@ -199,21 +188,18 @@ def _slope_errors(stage: Stage, exact: Values, truth: Values) -> Tensor:
     They are large where a gradient is wrong in every precision, or where outputs are rounded to fewer digits.
     """
     g = Generator().manual_seed(3)
-    steps = {}
+    ahead, behind, expected = {}, {}, []
     for name in stage.gradients:
-        steps[name] = 1e-7 * exact[name] * torch.randn(exact[name].shape, generator=g, dtype=torch.float64)
-    expected = torch.cat([(truth[f"d {name}"] * step).flatten(1) for name, step in steps.items()], 1)
-    sums = []
-    for sign in (1, -1):
-        moved = exact | {name: exact[name] + sign * step for name, step in steps.items()}
-        results = evaluate(stage, moved, "float64")
-        outputs = {name: value for name, value in results.items() if not name.startswith("d ")}
-        weighted = [(_weights(name, x) * x).reshape(len(x), -1).sum(1) for name, x in outputs.items()]
-        sums.append(sum(weighted))
-    return ((sums[0] - sums[1]) / 2 - expected.sum(1)).abs() / expected.abs().sum(1)
+        step = 1e-7 * exact[name] * torch.randn(exact[name].shape, generator=g, dtype=F64)
+        ahead[name] = exact[name] + step
+        behind[name] = exact[name] - step
+        expected.append((truth[f"d {name}"] * step).flatten(1))
+    sums = [evaluate(stage, exact | moved, "float64")[1] for moved in (ahead, behind)]
+    products = torch.cat(expected, 1)
+    return ((sums[0] - sums[1]) / 2 - products.sum(1)).abs() / products.abs().sum(1)
 
 
-def _condition(stage: Stage, exact: Values, truth: Values) -> Values:
+def condition(stage: Stage, exact: Values, truth: Values) -> Values:
     """Sizes of outputs and gradients, plus their largest change under random roundings of the inputs.
 
     Two roundings have size eps. Two more are opposite and as large as the budget, so that one of
@@ -227,16 +213,15 @@ def _condition(stage: Stage, exact: Values, truth: Values) -> Values:
     Returns:
         Sizes [n] by the names of ``truth``.
     """
-    spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
-    for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
+    spread = dict.fromkeys(truth, torch.zeros(1))
+    for seed, size in ((0, _STEP), (1, _STEP), (2, stage.factor * _STEP), (2, -stage.factor * _STEP)):
         g = Generator().manual_seed(seed)
         moved = dict(exact)
-        for name, value in exact.items():
-            if value.is_floating_point() and name not in stage.steady:
-                signs = 1 - 2 * torch.randint(2, value.shape[1:], generator=g)
-                moved[name] = value * (1 + size * _STEP * signs)
-        for name, value in evaluate(stage, moved, "float64").items():
-            spread[name] = torch.maximum(spread[name], _largest(value - truth[name]) / abs(size * _STEP))
+        for name in stage.rounded(exact):
+            signs = 1 - 2 * torch.randint(2, exact[name].shape[1:], generator=g)
+            moved[name] = exact[name] * (1 + size * signs)
+        for name, value in evaluate(stage, moved, "float64")[0].items():
+            spread[name] = torch.maximum(spread[name], _largest(value - truth[name]) / abs(size))
     for name, value in truth.items():
         if name.startswith("d "):
             spread[name] += torch.maximum(_largest(value), stage.sizes(exact))
@@ -245,35 +230,24 @@ def _condition(stage: Stage, exact: Values, truth: Values) -> Values:
     return spread
 
 
-def _plant(stage: Stage, value: float, cases: Values, dtype: str) -> tuple[Tensor, list[str]]:
-    """Plant a value that is not finite in one entry of one input of each case, next to another case.
-
-    Args:
-        stage: is run.
-        value: NaN or an infinity.
-        cases: inputs [n, ...] by name.
-        dtype: in which the stage runs.
-
-    Returns:
-        Errors of 0 where the value is refused, or shows in the outputs (unless the stage is silent)
-        and reaches no other case; else infinite. And their places.
-    """
-    names = [name for name, x in cases.items() if x.is_floating_point() and name not in stage.steady]
+def _plant(stage: Stage, value: float, cases: Values, dtype: str) -> Errors:
+    """Plant a value that is not finite in one entry of one input of each case, next to another case. The
+    error is 0 where it is rejected, or visible in the outputs (unless the stage is silent) and in those
+    of no other case; else it is infinite."""
+    names = stage.rounded(cases)
     count = len(cases[names[0]])
     errors = torch.zeros(count)
-    places = []
+    places = [f"in {names[i % len(names)]}" for i in range(count)]
     for i in range(count):
         pair = {name: x[[i, (i + 1) % count]].clone() for name, x in cases.items()}
-        name = names[i % len(names)]
-        entries = pair[name][0].view(-1)
+        entries = pair[names[i % len(names)]][0].view(-1)
         entries[int(torch.randint(len(entries), (), generator=Generator().manual_seed(i)))] = value
-        places.append(f"in {name}")
         try:
-            results = evaluate(stage, pair, dtype)
+            results, _ = evaluate(stage, pair, dtype)
         except InputError:
             continue
         first, other = torch.stack([x.reshape(2, -1).isfinite().all(1) for x in results.values()]).all(0)
         if not other or (first and not stage.silent):
             errors[i] = math.inf
-            places[i] = f"{'vanished' if other else 'reached another case'} from {name}"
+            places[i] = f"{'vanished' if other else 'reached another case'} {places[i]}"
     return errors, places

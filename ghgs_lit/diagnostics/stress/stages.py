@@ -1,4 +1,4 @@
-"""Stages of heads, recalibration, rendering, losses and metrics; all but those of whole models."""
+"""Stages of geometry, heads, recalibration, rendering, losses and metrics; all but those of whole models."""
 
 import copy
 import math
@@ -12,15 +12,26 @@ from ghgs_lit.diagnostics.stress.families import (
     COUNTS,
     UNITS,
     Values,
+    batch_of,
+    cameras_of,
+    matrices,
     normal,
     rig,
+    scene_points,
+    sphere,
     uniform,
     vary,
 )
-from ghgs_lit.diagnostics.stress.geometry import GEOMETRY, SEEN, SIZE, cameras_of, points_case
 from ghgs_lit.diagnostics.stress.measure import Stage, case_by_case
 from ghgs_lit.geometry.chamfer import chamfer
+from ghgs_lit.geometry.frame import Frame, to_world
+from ghgs_lit.geometry.masks import relative_bounds, relative_depth
+from ghgs_lit.geometry.precision import exact
+from ghgs_lit.geometry.projection import project, sample, unproject, world_to_camera
 from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
+from ghgs_lit.geometry.unprojection import subject_tokens
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.method.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.method.heads.attributes import OFFSET_UNIT, FootprintAttributes
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.method.heads.dpt import DPTHead
@@ -31,22 +42,95 @@ from ghgs_lit.ops.activation import confidence_of, footprint_attributes
 from ghgs_lit.ops.attention.cpu import attend_heads
 from ghgs_lit.ops.compile import processor_features
 from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
+from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.rendering import render
-from ghgs_lit.types import Gaussians, Tokens
+from ghgs_lit.types import DepthBounds, DepthMaps, Gaussians, Tokens
 
-_K = 6  #: Neighbours of a token
-
-
-def gaussians_of(v: Values) -> Gaussians:
-    """Gaussians of stacked cases."""
-    names = ("means", "quaternions", "scales", "opacities", "colors")
-    n, count = v["opacities"].shape
-    return Gaussians(*(v[name].flatten(0, 1) for name in names), splits=(count,) * n)
+SIZE = 16  #: Side of images in pixels
+CAMERAS = ("place", "cameras")  #: Ingredients of cameras, and of points before them
+SEEN = (*CAMERAS, "points", "points seen")
 
 
-def backend_of(values: Tensor) -> str:
-    """Plain renderer in float64, kernels in float32."""
-    return "reference" if values.dtype == torch.float64 else "cpu"
+def _project(v: Values) -> Values:
+    pixels, z = project(v["points"], *matrices(v))
+    camera = world_to_camera(v["points"], matrices(v)[1])
+    return {"camera": camera, "pixels": torch.where(z[..., None] > 0, pixels, 0.0)}
+
+
+def _pixels(family: str, g: Generator) -> Values:
+    scene = rig(family, g, 1, SIZE)
+    return {**scene, "pixels": uniform(g, 0, SIZE, 16, 2), "depth": families.depths(family, g, 16)}
+
+
+def _box(family: str, g: Generator) -> Values:
+    return rig(family, g, 1, 4) | {"half": 0.7 * UNITS.get(family, 1.0) * uniform(g, 1, 1.1, 3)}
+
+
+def _rays(v: Values) -> Values:
+    cameras = cameras_of(v, 4)
+    with exact("cpu"):  # as in the stage
+        bounds = depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
+        return {"directions": ray_directions(cameras), "near": bounds.near, "far": bounds.far}
+
+
+def _bounds(v: Values) -> Values:
+    """Bounds of the subject's pixels, computed in the subject's frame as the model does; infinite where the
+    true surface is outside of them."""
+    batch = batch_of(v)
+    frame = Frame.of(batch)
+    bounds = VisualHull(dilation=0.02)(frame.enter(batch))
+    metre = frame.metre.to(v["truth"])[:, None, None, None]
+    near, far = bounds.near * metre, bounds.far * metre
+    slack = 0.05 * v["truth"]
+    is_outside = (v["truth"] < near - slack) | (v["truth"] > far + slack)
+    near = torch.where(is_outside & (v["truth"] > 0), torch.inf, near)
+    return {"near": torch.where(v["masks"], near, 0.0), "far": torch.where(v["masks"], far, 0.0)}
+
+
+def _frame(v: Values) -> Values:
+    batch = batch_of(v)
+    frame = Frame.of(batch)
+    element = torch.arange(len(v["points"]))[:, None]
+    world = to_world(v["points"], element, frame.in_world(v["points"].dtype))
+    return {"extrinsics": frame.enter(batch).cameras.extrinsics, "world": world}
+
+
+def _maps(family: str, g: Generator) -> Values:
+    return scene_points(family, g) | {"maps": vary("images", family, uniform(g, 0, 1, 3, SIZE, SIZE), g)}
+
+
+def _sample(v: Values) -> Values:
+    pixels, z = project(v["points"], *matrices(v))
+    image = torch.arange(len(v["maps"]))[:, None].expand(v["points"].shape[:2])
+    return {"values": sample(v["maps"], image, torch.where(z[..., None] > 0, pixels, 1e9))}
+
+
+def _near_surface(family: str, g: Generator) -> Values:
+    values = sphere(family, g, 3, SIZE)
+    return {**values, "near": values["truth"] - 0.2, "far": values["truth"] + 0.2}
+
+
+def _photo(v: Values) -> Values:
+    """Disagreement, whose error relates to 1 however small the agreement is."""
+    return {"disagreement": 1 - photo_consistency(batch_of(v), DepthBounds(v["near"], v["far"]), 3)}
+
+
+def _depth_maps(family: str, g: Generator) -> Values:
+    offsets = torch.arange(SIZE) + 0.5 - SIZE / 2
+    disc = offsets[:, None].square() + offsets.square() < (0.3 * SIZE) ** 2
+    depth = families.depths(family, g, 2, SIZE, SIZE)
+    return {"depth": depth, "far": depth + 0.3, "masks": vary("masks", family, disc.expand(2, -1, -1), g)}
+
+
+def _tokens(v: Values) -> Values:
+    maps = DepthMaps(v["depth"], v["masks"], torch.ones_like(v["depth"]))
+    pixels, depth, valid = subject_tokens(maps, 4)
+    return {"pixels": torch.where(valid[..., None], pixels, 0.0), "depth": torch.where(valid, depth, 0.0)}
+
+
+def _relative(v: Values) -> Values:
+    bounds = relative_bounds(DepthBounds(v["depth"], v["far"]), v["masks"])
+    return {"relative": relative_depth(v["depth"], v["masks"]), "bounds": bounds}
 
 
 def _raw_depths(family: str, g: Generator) -> Values:
@@ -93,15 +177,10 @@ def _covariance(v: Values) -> Values:
 _GRID = (2, 3)
 _LAYERS = tuple(f"layer{i}" for i in range(4))
 
-
-def _head() -> DPTHead:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(5)
-        return DPTHead(32, 3, widths=(8, (4, 8, 8, 8))).requires_grad_(False)
-
-
-HEADS = {torch.float32: _head()}
-HEADS[torch.float64] = copy.deepcopy(HEADS[torch.float32]).double()
+with torch.random.fork_rng(devices=[]):
+    torch.manual_seed(5)
+    _HEAD = DPTHead(32, 3, widths=(8, (4, 8, 8, 8))).requires_grad_(False)
+HEADS = {torch.float32: _HEAD, torch.float64: copy.deepcopy(_HEAD).double()}
 
 
 def _features(family: str, g: Generator) -> Values:
@@ -115,8 +194,11 @@ def _dpt(v: Values) -> Values:
     return {"maps": HEADS[layers[0].dtype](Tokens(layers, layers[0], image, row, column, shape, 4))}
 
 
+_K = 6  #: Neighbours of a token
+
+
 def _cloud(family: str, g: Generator) -> Values:
-    values = points_case(family, g)
+    values = scene_points(family, g)
     surface = values["middle"] + 0.3 * UNITS.get(family, 1.0) * normal(g, 20, 3)
     view = torch.randint(3, (len(values["points"]),), generator=g)
     return {"points": values["points"], "surface": surface, "view": view}
@@ -146,13 +228,15 @@ def _token_features(family: str, g: Generator) -> Values:
     return {"features": vary("features", family, normal(g, len(index), 16), g), "index": index}
 
 
+def _qkv(family: str, g: Generator, *shape: int) -> Values:
+    """Queries, keys and values."""
+    return {n: vary("queries", family, vary("features", family, normal(g, *shape), g), g) for n in "qkv"}
+
+
 def _queries(family: str, g: Generator) -> Values:
     index = _neighbor_table(family, g)
-    values = {"cosines": uniform(g, -1, 1, *index.shape), "index": index}
-    for name in ("q", "k", "v"):
-        ordinary = vary("features", family, normal(g, len(index), 32), g)
-        values[name] = vary("queries", family, ordinary, g)
-    return values
+    cosines = uniform(g, -1, 1, *index.shape)
+    return {"cosines": cosines, "index": index, **_qkv(family, g, len(index), 32)}
 
 
 BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped", "log")}
@@ -161,10 +245,10 @@ BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped"
 def _attention(v: Values) -> Values:
     """Eq. 3 with every use of the similarity."""
     inputs = [v[name] for name in ("q", "k", "v", "index")]
-    results = {}
-    for name, block in BLOCKS.items():
-        results[name] = attend_to_neighbors(*inputs, block.num_heads, *block.factor_and_bias(v["cosines"]))
-    return results
+    return {
+        name: attend_to_neighbors(*inputs, block.num_heads, *block.factor_and_bias(v["cosines"]))
+        for name, block in BLOCKS.items()
+    }
 
 
 def _products(v: Values) -> Tensor:
@@ -175,17 +259,26 @@ def _products(v: Values) -> Tensor:
 
 
 def _heads(family: str, g: Generator) -> Values:
-    values = {}
-    for name in ("q", "k", "v"):
-        ordinary = vary("features", family, normal(g, 20, 64), g)
-        values[name] = vary("queries", family, ordinary, g).expand(2, 20, 64).clone()
-    return values
+    return {name: value.repeat(2, 1, 1) for name, value in _qkv(family, g, 20, 64).items()}
 
 
 def _attend(v: Values) -> Values:
+    inputs = (v["q"], v["k"], v["v"])
     if v["q"].dtype == torch.float64:
-        return {"attended": functional.scaled_dot_product_attention(v["q"], v["k"], v["v"]).transpose(1, 2)}
-    return {"attended": attend_heads(v["q"], v["k"], v["v"])}
+        return {"attended": functional.scaled_dot_product_attention(*inputs).transpose(1, 2)}
+    return {"attended": attend_heads(*inputs)}
+
+
+def gaussians_of(v: Values) -> Gaussians:
+    """Gaussians of stacked cases."""
+    names = ("means", "quaternions", "scales", "opacities", "colors")
+    n, count = v["opacities"].shape
+    return Gaussians(*(v[name].flatten(0, 1) for name in names), splits=(count,) * n)
+
+
+def backend_of(values: Tensor) -> str:
+    """Plain renderer in float64, kernels in float32."""
+    return "reference" if values.dtype == torch.float64 else "cpu"
 
 
 def _splats(family: str, g: Generator) -> Values:
@@ -222,16 +315,6 @@ def _brightest(v: Values) -> Tensor:
     return torch.cat((v["image"], v["target"]), 1).flatten(1).abs().amax(1)
 
 
-def _moments(v: Values) -> Tensor:
-    """Condition number of SSIM, which subtracts moments of size x^2 and compares the rest with 0.03^2."""
-    return _brightest(v).square() / 9e-4
-
-
-def _terms(v: Values) -> Tensor:
-    """Size of the terms that SSIM's gradients subtract: 2 x / 0.03^2, each a mean over the windows."""
-    return 2 * _brightest(v) / (9e-4 * 3 * (SIZE - 10) ** 2)
-
-
 def _losses(v: Values) -> Values:
     return {"l1": (v["image"] - v["target"]).abs().flatten(1).mean(1), "ssim": ssim(v["image"], v["target"])}
 
@@ -243,9 +326,56 @@ def _metrics(v: Values) -> Values:
 
 _BOUNDED = "a value between bounds is finite whatever the raw value"
 _INFINITE = "an infinite logit is a weight of 1"
+_OUTSIDE_FRAME = ("wide", "degenerate")  # the subject is smaller than a pixel, or nowhere in the frame
+_HOLDS = "a sum of a few products a coordinate; each rounds once, and the inputs' rounding is in kappa"
+_REFUSED = "cameras that are not finite are refused before this stage"
 
 STAGES = [
-    *GEOMETRY,
+    Stage(
+        "projection", SEEN, scene_points, _project, 20, _HOLDS,
+        gradients=("points", "lenses", "poses"), steady=("middle",),
+        silent="a point behind the camera has no pixel",
+    ),
+    Stage(
+        "unprojection", (*CAMERAS, "depths"), _pixels,
+        lambda v: {"points": unproject(v["pixels"], v["depth"], *matrices(v))}, 20, _HOLDS,
+        gradients=("pixels", "depth", "lenses", "poses"), steady=("middle",),
+        silent="an infinite focal length is a ray along the axis; the model refuses it",
+    ),
+    Stage(
+        "rays and box", CAMERAS, _box, _rays, 50,
+        "as projection, and a division by a component of the direction", silent="NaN loses every comparison",
+    ),
+    Stage(
+        "bounds and hull", (*CAMERAS, "masks"), lambda family, g: sphere(family, g, 4, 24), _bounds, 100,
+        "decisions on a grid: one cell of 1/20 of the depth may differ (kappa)",
+        kappa=lambda v: torch.tensor([0.05 / (100 * torch.finfo(torch.float32).eps)]),
+        steady=("truth", "middle", "images"), seeds=32, without=_OUTSIDE_FRAME, silent=_REFUSED,
+    ),
+    Stage(
+        "subject frame", (*CAMERAS, "masks"),
+        lambda family, g: sphere(family, g, 3, SIZE) | {"points": normal(g, 16, 3)}, _frame, 20,
+        "all of it in float64, rounded once", gradients=("points",), steady=("truth", "middle", "images"),
+        without=_OUTSIDE_FRAME, silent=_REFUSED,
+    ),
+    Stage(
+        "samples of maps", (*SEEN, "images"), _maps, _sample, 20,
+        "a mean of four pixels; their shares lose the digits of a pixel's place (kappa)",
+        steady=("middle",), seeds=64, without=("nan", "inf"),  # its callers clean their maps
+    ),
+    Stage(
+        "photo-consistency", (*CAMERAS, "images", "masks"), _near_surface, _photo, 100,
+        "exp of a colour difference over 0.1, of bilinear samples at a projected place",
+        steady=("truth", "middle"), seeds=64, silent="agreement of what cannot be compared is 0",
+    ),
+    Stage(
+        "token points", ("depths", "masks"), _depth_maps, _tokens, 50, "means of 16 values",
+        gradients=("depth",), silent="only depths inside the mask count",
+    ),
+    Stage(
+        "relative depths", ("depths", "masks"), _depth_maps, _relative, 50, "means of 256 values",
+        silent="only depths inside the mask count",
+    ),
     Stage(
         "depth activation", ("raw values", "place"), _raw_depths, _depth, 50, "a sigmoid and two divisions",
         gradients=("raw", "near", "far"), silent=_BOUNDED,
@@ -294,7 +424,11 @@ STAGES = [
     Stage(
         "L1 and SSIM", ("images",), _pair, _losses, 20,
         "five blurs of 121 products; the subtraction of moments is in kappa",
-        gradients=("image",), kappa=_moments, sizes=_terms, seeds=96,
+        gradients=("image",), seeds=96,
+        # SSIM subtracts moments of size x^2 and compares the rest with 0.03^2.
+        kappa=lambda v: _brightest(v).square() / 9e-4,
+        # Its gradients subtract terms of 2 x / 0.03^2, each a mean over the windows.
+        sizes=lambda v: 2 * _brightest(v) / (9e-4 * 3 * (SIZE - 10) ** 2),
     ),
     Stage(
         "Chamfer", ("place", "points", "neighbors"), _cloud,
@@ -305,7 +439,7 @@ STAGES = [
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,
         "powers 0.42 and 2.4 of colours, seven filters, a power 0.7 of a distance",
         # FLIP raises a rounding error of a colour to a power of about 0.1; one pixel of 256 may have one.
-        kappa=lambda v: torch.full((len(v["image"]),), 8.0, dtype=torch.float64),
+        kappa=lambda v: torch.tensor([8.0]),
         silent="FLIP clamps colours to [0, 1]",
     ),
 ]  # fmt: skip

@@ -10,11 +10,20 @@ import torch
 from torch import Generator, Tensor, nn
 
 from ghgs_lit.config import run_of
-from ghgs_lit.diagnostics.stress.families import FAMILIES, Values, directions, sphere, uniform, vary
-from ghgs_lit.diagnostics.stress.geometry import batch_of, cameras_of
+from ghgs_lit.diagnostics.stress.families import (
+    FAMILIES,
+    Values,
+    batch_of,
+    cameras_of,
+    directions,
+    sphere,
+    uniform,
+    vary,
+)
 from ghgs_lit.diagnostics.stress.measure import Stage, case_by_case
 from ghgs_lit.diagnostics.stress.stages import STAGES as PARTS
 from ghgs_lit.diagnostics.stress.stages import backend_of
+from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.losses import Losses
@@ -45,19 +54,13 @@ def _surface(views: int, size: int, family: str, g: Generator) -> Values:
 
 
 def _seen(v: Values) -> tuple[Gaussians, Batch]:
-    """Splats of a pixel's size on the true surface of one case, and its photographs, darker by gains."""
+    """Splats of a pixel's size on the true surface of one case, and its input views, darker by gains."""
     one = {name: value[None] for name, value in v.items()}
     one["images"] = one["images"] * one["gains"][..., None, None]
     batch = batch_of(one)
     subject = batch.masks & (one["truth"] > 0)
-    image, pixel = subject.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
-    means = unproject_maps(one["truth"], batch.cameras)[subject]
-    size = (one["truth"] / batch.cameras.intrinsics[..., 0, 0, None, None])[subject]
-    quaternions = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
-    colors = batch.images.movedim(2, -1)[subject]
-    scales = 0.5 * size[:, None].expand(-1, 3)
-    opacities = one["opacities"][subject]
-    return Gaussians(means, quaternions, scales, opacities, colors, (len(means),), image, pixel), batch
+    splats = splats_at(batch, one["truth"], subject, sigma=0.5)
+    return replace(splats, opacities=one["opacities"][subject]), batch
 
 
 def _gains(v: Values) -> Values:

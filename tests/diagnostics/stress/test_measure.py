@@ -6,10 +6,11 @@ from collections import Counter
 
 import pytest
 import torch
+from torch.utils.data import default_collate
 
 from ghgs_lit.cli.stress import run_tasks, tasks_of
 from ghgs_lit.diagnostics.stress.families import FAMILIES
-from ghgs_lit.diagnostics.stress.measure import DTYPES, PLANTED, _condition, evaluate, measure, stack
+from ghgs_lit.diagnostics.stress.measure import DTYPES, PLANTED, condition, evaluate, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
 from tests.helpers.verbs import ghgs
 
@@ -46,10 +47,12 @@ def test_a_value_that_reaches_another_case_is_found():
 def test_the_condition_of_a_case_does_not_depend_on_others():
     """A reported seed reproduces its figure alone, up to float64 roundings over the step of 1e-7."""
     stage = STAGES["unit vectors"]
-    cases = stack([stage.make("ordinary", torch.Generator().manual_seed(seed)) for seed in range(3)])
+    cases = default_collate(
+        [stage.make("ordinary", torch.Generator().manual_seed(seed)) for seed in range(3)]
+    )
     exact = {name: value.double() for name, value in cases.items()}
     last = {name: value[2:] for name, value in exact.items()}
-    conditions = [_condition(stage, inputs, evaluate(stage, inputs, "float64")) for inputs in (exact, last)]
+    conditions = [condition(stage, inputs, evaluate(stage, inputs, "float64")[0]) for inputs in (exact, last)]
     for name, values in conditions[1].items():
         torch.testing.assert_close(conditions[0][name][2:], values, rtol=1e-6, atol=0)
 

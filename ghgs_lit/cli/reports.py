@@ -1,10 +1,18 @@
-"""Output of tables as Markdown and on the terminal."""
+"""Reports of ``ghgs benchmark`` and ``ghgs stress``: tables on the terminal and in Markdown, all numbers in
+JSON, and the exit code."""
 
+import json
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from tabulate import tabulate
+
+from ghgs_lit.cli.runtime import announce
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.results import plain
 
 Tables = dict[str, pd.DataFrame]  #: Tables of texts by their titles
 
@@ -33,7 +41,7 @@ def texts(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.Dat
     return pd.DataFrame(table)
 
 
-def pivoted(frame: pd.DataFrame, index: str, columns: str, values: str, form: str) -> pd.DataFrame:
+def pivot(frame: pd.DataFrame, index: str, columns: str, values: str, form: str) -> pd.DataFrame:
     """Pivot table of texts; rows and columns keep their order.
 
     Args:
@@ -48,21 +56,41 @@ def pivoted(frame: pd.DataFrame, index: str, columns: str, values: str, form: st
     return table.map(text, form=form).reset_index()
 
 
-def document(title: str, notes: Sequence[str], tables: Tables) -> str:
-    """Markdown page of notes, then each table below its title.
-
-    Args:
-        title: of the page.
-        notes: paragraphs.
-        tables: by title.
-    """
-    parts = [f"# {title}", *notes]
-    for name, table in tables.items():
-        parts += [f"## {name}", table.to_markdown(index=False, disable_numparse=True)]
-    return "\n\n".join(parts) + "\n"
-
-
 def print_tables(tables: Tables) -> None:
     """Print tables at full width."""
     for name, table in tables.items():
         print(name, tabulate(table, "keys", showindex=False, disable_numparse=True), sep="\n\n", end="\n\n")
+
+
+def publish(
+    directory: Path,
+    command: str,
+    notes: Sequence[str],
+    tables: Tables,
+    content: Mapping[str, Any],
+    failures: Sequence[str],
+) -> None:
+    """Write ``<command>.md`` and ``<command>.json``, and print the latter's path and the failures.
+
+    Args:
+        directory: of the run.
+        command: its name.
+        notes: paragraphs of the Markdown page, the first one its title.
+        tables: of the page, by title.
+        content: of the JSON; numbers that are not finite become null.
+        failures: why the command fails, a line each, for the error stream.
+
+    Raises:
+        SystemExit: code 1: there are failures.
+    """
+    parts = [f"# {notes[0]}", *notes[1:]]
+    for title, table in tables.items():
+        parts += [f"## {title}", table.to_markdown(index=False, disable_numparse=True)]
+    write_text_atomically(directory / f"{command}.md", "\n\n".join(parts) + "\n")
+    path = directory / f"{command}.json"
+    write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+    announce(path)
+    for line in failures:
+        print(f"ghgs {command}: {line}", file=sys.stderr)
+    if failures:
+        raise SystemExit(1)
