@@ -13,7 +13,7 @@ from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.runtime.watching import time_mark
-from ghgs_lit.training.optimization import Optimization, hold_rates, plain_rates
+from ghgs_lit.training.optimization import Optimization, convert_rates_to_numbers, hold_rates
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
@@ -89,7 +89,7 @@ class BudgetedModule(L.LightningModule):
         part = batch_idx % self.trainer.accumulate_grad_batches
         return [self.config.get("seed", 0), self.global_step, part]
 
-    def class_numbers(self, batch_idx: int) -> list[int] | None:
+    def shared_numbers(self, batch_idx: int) -> list[int] | None:
         """Seed for choices that ``data.class_steps`` consecutive batches share; None if that is 1."""
         steps = (self.config.get("data") or {}).get("class_steps", 1)
         seed, step, part = self.step_numbers(batch_idx)
@@ -183,4 +183,4 @@ class BudgetedModule(L.LightningModule):
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = self.config
         checkpoint["frozen"] = [name for name, p in self.named_parameters() if not p.requires_grad]
-        plain_rates(checkpoint)
+        convert_rates_to_numbers(checkpoint)

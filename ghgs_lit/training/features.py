@@ -146,7 +146,7 @@ class FeatureCache:
             OSError: the disk is full.
         """
         paths = [self._path(image, images.device) for image in images.detach().cpu()]
-        stored = [_mapped(path) for path in paths]
+        stored = [_map_file(path) for path in paths]
         lacking = [number for number, tokens in enumerate(stored) if tokens is None]
         if lacking:
             new = compute(images[lacking]).to(self.dtype)
@@ -181,7 +181,7 @@ class FeatureCache:
         return self.place(device) / name[:2] / f"{name}.npy"
 
 
-def _mapped(path: Path) -> np.ndarray | None:
+def _map_file(path: Path) -> np.ndarray | None:
     """Tokens [p, c] of a file, memory-mapped as int16; None if it is missing or damaged."""
     try:
         return np.load(path, mmap_mode="r")

@@ -38,7 +38,7 @@ class Step:
     Args:
         batch: the batch of this process.
         seed: seed of all random numbers of the step.
-        budget: which patches the encoder processes (:func:`~ghgs_lit.training.module.drawn_budget`);
+        budget: which patches the encoder processes (:func:`~ghgs_lit.training.module.sample_budget`);
             None: as configured.
         rounds: number of rounds; None: sampled with the seed."""
 
@@ -160,7 +160,7 @@ class Guard:
         self._steps.clear()
         self._in_a_row = 0
 
-    def refuse(self, module: L.LightningModule, scale: float) -> None:
+    def skip(self, module: L.LightningModule, scale: float) -> None:
         """Find and save the fault, and remove the gradients, so that the optimizer changes nothing.
 
         Args:

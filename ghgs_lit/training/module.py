@@ -32,7 +32,7 @@ Choice = TypeVar("Choice")
 VALIDATED = ("psnr", "psnr_box", "ssim", "lpips", *FURTHER, "psnr_edge")
 
 
-def drawn_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int = 1) -> Choice:
+def sample_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int = 1) -> Choice:
     """Sample which patches the encoder processes in a training step.
 
     Args:
@@ -53,7 +53,7 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
     """Context in which the encoder processes the patches of a budget.
 
     Args:
-        budget: see :func:`drawn_budget`; None: as the model is configured."""
+        budget: see :func:`sample_budget`; None: as the model is configured."""
     return nullcontext() if budget is None else seeing(model.encoder, KeptTokens.of_budget(budget))
 
 
@@ -90,7 +90,7 @@ class GHGSModule(BudgetedModule):
             the batch. Its weights, if any, are trained with the model's.
         optimization: see :class:`BudgetedModule`.
         config: see :class:`BudgetedModule`.
-        token_budgets: budgets from which each training step samples (:func:`drawn_budget`); None: as
+        token_budgets: budgets from which each training step samples (:func:`sample_budget`); None: as
             the model is configured.
 
     Attributes:
@@ -162,12 +162,12 @@ class GHGSModule(BudgetedModule):
         total, values = self.losses(prediction, rendering, step.batch)
         return prediction, total, values
 
-    def _called(self, step: Step) -> Outcome:
+    def _run_eagerly(self, step: Step) -> Outcome:
         """Run the forward pass of a step eagerly."""
         prediction, total, values = self.forward_losses(step)
         return Outcome(total, values, len(prediction.gaussians))
 
-    def _captured(self, step: Step) -> Outcome | None:
+    def _run_captured(self, step: Step) -> Outcome | None:
         """Run the forward pass of a step with CUDA-graph capture; None: it must run eagerly."""
         captured = self.captured_step
         scaler = self._scaler
@@ -178,15 +178,15 @@ class GHGSModule(BudgetedModule):
         with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
             return captured(step.batch, scale)
 
-    def _step(self, batch: Batch, batch_idx: int) -> Step:
+    def _make_step(self, batch: Batch, batch_idx: int) -> Step:
         """Assemble all inputs of a training step."""
         budget = count = None
-        shared = self.class_numbers(batch_idx)
+        shared = self.shared_numbers(batch_idx)
         # Equal in all processes, so that none waits for another.
         if self.token_budgets is not None:
-            budget = drawn_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
+            budget = sample_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
         if shared and isinstance(getattr(self.model, "rounds", None), Rounds):
-            count = drawn_budget(self.model.rounds.options.training_counts, shared, stream=2)
+            count = sample_budget(self.model.rounds.options.training_counts, shared, stream=2)
         return Step(batch, self.step_seed(batch_idx), budget, count)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -195,8 +195,8 @@ class GHGSModule(BudgetedModule):
 
         Returns:
             The total loss, a scalar."""
-        step = self._step(batch, batch_idx)
-        total, values, gaussians = self._captured(step) or self._called(step)
+        step = self._make_step(batch, batch_idx)
+        total, values, gaussians = self._run_captured(step) or self._run_eagerly(step)
         self.guard.note(step, total)
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
@@ -214,11 +214,11 @@ class GHGSModule(BudgetedModule):
         with seen_attributes(head) as seen:
             prediction, rendering = self(batch)
         size = len(batch.images)
-        for name, values in self._measured(rendering.image, batch.targets, VALIDATED).items():
+        for name, values in self._measure(rendering.image, batch.targets, VALIDATED).items():
             self.means[name].update(values)
             is_first = name == VALIDATED[0]
             self.log(f"val/{name}", self.means[name], prog_bar=is_first, on_epoch=True, batch_size=size)
-        means = self._rounds(batch, prediction)
+        means = self._measure_rounds(batch, prediction)
         if seen and head.has_offset_limit:
             means["val/offsets_at_limit"] = offsets_at_limit(seen[-1])
         if batch.depths is not None:
@@ -227,7 +227,7 @@ class GHGSModule(BudgetedModule):
         self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
 
-    def _measured(
+    def _measure(
         self, image: Float[Tensor, "b t 3 h w"], targets: Targets, names: Sequence[str]
     ) -> dict[str, Tensor]:
         """Metrics of each target view, [b * t], by name; without LPIPS where it is not available."""
@@ -236,12 +236,12 @@ class GHGSModule(BudgetedModule):
         depths = None if targets.depths is None else targets.depths.flatten(0, 1)
         return self.metrics.measure(*flat, known, depths)
 
-    def _rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+    def _measure_rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
         """PSNR in dB and depth error in mm before each round."""
         values = {}
         for number, draft in enumerate(prediction.drafts, start=1):
             image = self.renderer(draft, batch.targets.cameras).image
-            psnr = self._measured(image, batch.targets, ("psnr",))["psnr"]
+            psnr = self._measure(image, batch.targets, ("psnr",))["psnr"]
             values[f"val/psnr_before_round_{number}"] = psnr.mean()
             if batch.depths is not None:
                 error = _depth_error(batch, prediction.rounds[number - 1])
@@ -265,7 +265,7 @@ class GHGSModule(BudgetedModule):
         else:
             scale = 1.0 if self._scaler is None else self._scaler.get_scale()
             if not loss_holds or scale <= 1:
-                self.guard.refuse(self, scale)
+                self.guard.skip(self, scale)
                 return
         self.guard.accept()
 

@@ -43,7 +43,7 @@ def is_matrix(parameter: nn.Parameter) -> bool:
     return min(rows, parameter.numel() // max(rows, 1)) >= SMALLEST_SIDE
 
 
-def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
+def orthogonalize(matrices: Sequence[Tensor]) -> list[Tensor]:
     """Orthogonalise matrices approximately: replace their singular values by values of 0.7 to 1.2.
 
     Padding with zeros does not change singular vectors, so small matrices of many sizes are padded and
@@ -65,22 +65,22 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
             by_shape.setdefault(matrix.shape, []).append(number)
     for numbers in by_shape.values():
         stacked = torch.stack([matrices[number] for number in numbers])
-        for number, result in zip(numbers, _orthogonalized(stacked), strict=True):
+        for number, result in zip(numbers, _orthogonalize_stack(stacked), strict=True):
             results[number] = result
     if small:
-        for number, result in zip(small, _small([matrices[n] for n in small]), strict=True):
+        for number, result in zip(small, _orthogonalize_small([matrices[n] for n in small]), strict=True):
             results[number] = result
     return results
 
 
-def _small(matrices: list[Tensor]) -> list[Tensor]:
+def _orthogonalize_small(matrices: list[Tensor]) -> list[Tensor]:
     """Orthogonalise matrices with a side of at most :data:`PADDED_SIDE`."""
     packing = _packing(tuple(tuple(matrix.shape) for matrix in matrices), matrices[0].device)
     values = torch.cat([*(matrix.reshape(-1) for matrix in matrices), matrices[0].new_zeros(1)])
     products = []
     for places in packing.places:
         padded = values.index_select(0, places.view(-1)).view(places.shape)
-        products.append(_orthogonalized(padded).reshape(-1))
+        products.append(_orthogonalize_stack(padded).reshape(-1))
     values = torch.cat(products).index_select(0, packing.back)
     parts = values.split([matrix.numel() for matrix in matrices])
     return [part.view(matrix.shape) for part, matrix in zip(parts, matrices, strict=True)]
@@ -129,10 +129,10 @@ def _power_of_two(count: int) -> int:
     return 1 << (count - 1).bit_length()
 
 
-def _orthogonalized(matrices: Tensor) -> Tensor:
+def _orthogonalize_stack(matrices: Tensor) -> Tensor:
     """Orthogonalise matrices [n, R, C] by polynomials of the smaller Gram matrices."""
     if matrices.shape[1] > matrices.shape[2]:
-        return _orthogonalized(matrices.mT).mT
+        return _orthogonalize_stack(matrices.mT).mT
     a, b, c = COEFFICIENTS
     largest = torch.linalg.vector_norm(matrices, torch.inf, dim=(1, 2), keepdim=True)
     # Prevents an underflow of squares.
@@ -242,7 +242,7 @@ class Muon(torch.optim.AdamW):
         torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
         directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov momentum
         directions = [direction.flatten(1) for direction in directions]
-        steps = orthogonalized(directions)
+        steps = orthogonalize(directions)
         torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
         torch._foreach_mul_(steps, group["lr"])
         torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])

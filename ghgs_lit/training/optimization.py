@@ -137,7 +137,7 @@ def hold_rates(optimizer: torch.optim.Optimizer) -> None:
             group["lr"] = torch.full((), float(group["lr"]), device=group["params"][0].device)
 
 
-def plain_rates(checkpoint: dict) -> None:
+def convert_rates_to_numbers(checkpoint: dict) -> None:
     """Replace learning rates that are tensors (:func:`hold_rates`) by numbers.
 
     Args:

@@ -11,7 +11,7 @@ import torch
 from ghgs_lit.cli.verbs import Train
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.module import drawn_budget, number_of_rounds, token_budget
+from ghgs_lit.training.module import number_of_rounds, sample_budget, token_budget
 from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
@@ -43,7 +43,7 @@ def test_the_draw_is_even_and_depends_on_all_numbers():
     """If the step, the seed or the part of an accumulated step had no effect, budgets would repeat."""
     budgets = ["all", "window", 0, 0]
     drawn = [
-        [drawn_budget(budgets, [seed, step, part]) for step in range(400)]
+        [sample_budget(budgets, [seed, step, part]) for step in range(400)]
         for seed in (0, 1)
         for part in (0, 1)
     ]
@@ -51,7 +51,7 @@ def test_the_draw_is_even_and_depends_on_all_numbers():
     assert set(shares) == {"all", "window", 0}
     assert 160 < shares[0] < 240
     assert len({tuple(row) for row in drawn}) == 4
-    assert drawn[0] == [drawn_budget(budgets, [0, step, 0]) for step in range(400)]
+    assert drawn[0] == [sample_budget(budgets, [0, step, 0]) for step in range(400)]
 
 
 class Watched(Standin):
@@ -104,7 +104,7 @@ def test_a_class_of_steps_has_one_budget_and_one_number_of_rounds(tmp_path):
     model = make_model("model=recurrent").train()
     module = GHGSModule(model, flat_renderer, losses_of({"render_l1": 1.0}), Optimization(), CLASSES)
     module._trainer = SimpleNamespace(accumulate_grad_batches=2, global_step=2, strategy=None)
-    steps = [module._step(example_batch(), number) for number in range(4)]
+    steps = [module._make_step(example_batch(), number) for number in range(4)]
     assert len({step.seed for step in steps}) == 2
     assert steps[0].rounds == steps[1].rounds in model.rounds.options.training_counts
     with number_of_rounds(model, 3):

@@ -104,7 +104,7 @@ class Signal(L.Callback):
             os.kill(os.getpid(), self.number)
 
 
-def stopped(folder, sender: Signal) -> int:
+def train_until_signal(folder, sender: Signal) -> int:
     """Train until the signal, and return the exit code."""
     with pytest.raises(Interrupted) as stop, interruptible():
         fit(folder, Cut(), more=[sender, StopAtStep()])
@@ -160,10 +160,10 @@ def test_nothing_is_saved_between_the_parts_of_a_step(tmp_path):
 
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
     """A repeated signal does not wait for the step, but one signal that is delivered twice counts once."""
-    assert stopped(tmp_path / "twice", Signal(5, signal.SIGINT, times=2)) == 130
+    assert train_until_signal(tmp_path / "twice", Signal(5, signal.SIGINT, times=2)) == 130
     assert (tmp_path / "twice" / "checkpoints" / "last.ckpt").exists()
     monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
-    assert stopped(tmp_path / "now", Signal(2, signal.SIGTERM, times=2)) == 143
+    assert train_until_signal(tmp_path / "now", Signal(2, signal.SIGTERM, times=2)) == 143
     assert not (tmp_path / "now" / "checkpoints" / "last.ckpt").exists()
 
 
@@ -172,7 +172,7 @@ def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path,
     monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
     sender = Signal(5, signal.SIGUSR1)
     sender.also = signal.SIGTERM
-    assert stopped(tmp_path, sender) == 128 + signal.SIGUSR1
+    assert train_until_signal(tmp_path, sender) == 128 + signal.SIGUSR1
     assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 5
 
 

@@ -28,7 +28,7 @@ from tests.helpers.training import Standin, example_batch, flat_renderer, traine
 CONFIG = {"seed": 1}
 
 
-def spoiled(batch):
+def spoil_targets(batch):
     """A copy of a batch in which the last subject has an infinite target."""
     images = batch.targets.images.clone()
     images[-1] = torch.inf
@@ -43,7 +43,9 @@ def module(limit=0, depth=1.0) -> GHGSModule:
 
 
 def loader(*bad: int, count: int = 6) -> DataLoader:
-    batches = [spoiled(example_batch(seed=s)) if s in bad else example_batch(seed=s) for s in range(count)]
+    batches = [
+        spoil_targets(example_batch(seed=s)) if s in bad else example_batch(seed=s) for s in range(count)
+    ]
     return DataLoader(batches, batch_size=None, collate_fn=lambda b: b)
 
 

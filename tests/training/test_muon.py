@@ -8,8 +8,8 @@ from torch import nn
 
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.training import Optimization, muon
-from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
-from ghgs_lit.training.optimization import hold_rates, plain_rates
+from ghgs_lit.training.muon import Muon, is_matrix, orthogonalize
+from ghgs_lit.training.optimization import convert_rates_to_numbers, hold_rates
 from tests.helpers.capture_backends import OperatorBackend
 from tests.helpers.models import load_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
@@ -60,8 +60,8 @@ def test_padding_and_company_change_nothing(kind, monkeypatch):
         (129, 130),
     ]
     several = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in shapes]
-    for matrix, found in zip(several, orthogonalized(several), strict=True):
-        torch.testing.assert_close(found, muon._orthogonalized(matrix[None])[0], atol=1e-10, rtol=0)
+    for matrix, found in zip(several, orthogonalize(several), strict=True):
+        torch.testing.assert_close(found, muon._orthogonalize_stack(matrix[None])[0], atol=1e-10, rtol=0)
     muon._packing.cache_clear()
 
 
@@ -97,10 +97,10 @@ def test_neither_scale_nor_company_matters():
     zeros."""
     generator = torch.Generator().manual_seed(4)
     several = [torch.randn(shape, generator=generator) for shape in ((16, 20), (16, 20), (20, 16), (16, 99))]
-    alone = [orthogonalized([matrix])[0] for matrix in several]
+    alone = [orthogonalize([matrix])[0] for matrix in several]
     scaled = [scale * matrix for scale, matrix in zip((1, 1e-30, 1e12, 1), several, strict=True)]
     zeros = torch.zeros(16, 20)
-    torch.testing.assert_close(orthogonalized([*scaled, zeros]), [*alone, zeros], atol=1e-4, rtol=0)
+    torch.testing.assert_close(orthogonalize([*scaled, zeros]), [*alone, zeros], atol=1e-4, rtol=0)
 
 
 def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
@@ -119,7 +119,7 @@ def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
         assert [group["lr"] for group in optimizer.param_groups] == rates
         assert [rate.item() for rate in rates] == pytest.approx([0.01 / 3, 0.02 / 3])
         files = {"optimizer_states": [optimizer.state_dict()], "lr_schedulers": [schedule.state_dict()]}
-        plain_rates(files)
+        convert_rates_to_numbers(files)
     assert [group["lr"] for group in files["optimizer_states"][0]["param_groups"]] == pytest.approx(
         [0.01 / 3, 0.02 / 3]
     )
@@ -176,7 +176,7 @@ def test_parameters_without_gradient_stay():
     assert moved == {"square", "tall", "wide", "output", "token"}
 
 
-def stepped(backend, capturable=True, steps=5):
+def take_steps(backend, capturable=True, steps=5):
     """Take steps with a schedule on the pretend device; returns the weights, and counts of captures."""
     model = Small().to(DEVICE)
     model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
@@ -203,9 +203,9 @@ def test_steps_that_are_played_back_are_the_same(capturable):
     """Replayed steps equal eager ones, also for channels-last weights; neither a capture nor a failed
     attempt (AdamW that counts steps on the host) takes an extra step."""
     with pretend_device():
-        wanted, _ = stepped(None, capturable)
+        wanted, _ = take_steps(None, capturable)
         with nullcontext() if capturable else pytest.warns(UserWarning, match="not captured as a CUDA graph"):
-            found, counts = stepped(OperatorBackend(), capturable)
+            found, counts = take_steps(OperatorBackend(), capturable)
     for one, other in zip(wanted, found, strict=True):
         assert torch.equal(one, other)
     wanted = {"eager": 2, "captured": 1, "replayed": 2} if capturable else {"eager": 4, "refused": 1}

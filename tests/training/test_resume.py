@@ -74,7 +74,7 @@ def fit(folder, cut: Cut, resume=None, every=3, more=(), subject=None, **options
     return subject
 
 
-def killed(folder, cut: Cut, **options):
+def train_until_cut(folder, cut: Cut, **options):
     """Train until the cut; returns the last checkpoint and its step."""
     with pytest.raises(PowerCut):
         fit(folder, cut, **options)
@@ -120,7 +120,7 @@ def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating, e
     due at a validation is written after it, as a restart does not repeat it, and none is written between
     two batches of a step, where gradients would be lost."""
     first, options = Cut(at, validating), {"every": every, "accumulate_grad_batches": accumulate}
-    last, step = killed(tmp_path, first, **options)
+    last, step = train_until_cut(tmp_path, first, **options)
     assert step == saved  # the cut precedes a checkpoint that is due at the same step
     second = Cut()
     subject = fit(tmp_path, second, resume=last, **options)
@@ -142,7 +142,7 @@ def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumul
     in_epoch, last = -(-5 // accumulate), None
     if cut is not None:
         # The checkpoint is from the step before the cut, so the batches of the cut step repeat.
-        last, steps = killed(tmp_path, Cut(cut), every=1, accumulate_grad_batches=accumulate)
+        last, steps = train_until_cut(tmp_path, Cut(cut), every=1, accumulate_grad_batches=accumulate)
         del drawn[steps // in_epoch * 5 + steps % in_epoch * accumulate :]
     fit(tmp_path, Cut(), resume=last, accumulate_grad_batches=accumulate)
     # 16 steps: full epochs of 5 batches, then the rest.
@@ -162,7 +162,7 @@ def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monke
 
     monkeypatch.setattr(frozen, "OWN", 0)
     expected = fit(tmp_path / "whole", Cut(), subject=half_frozen())
-    last, _ = killed(tmp_path / "a", Cut(10), subject=half_frozen())
+    last, _ = train_until_cut(tmp_path / "a", Cut(10), subject=half_frozen())
     assert list(torch.load(last, weights_only=True)["state_dict"]) == ["model.shift"]
     target = tmp_path / ("b" if elsewhere else "a")
     subject = fit(target, Cut(), resume=last, subject=half_frozen())
@@ -207,7 +207,7 @@ def test_time_that_was_used_stays_used(tmp_path):
             super().on_train_batch_end(trainer, pl_module)
 
     options = {"max_time": {"seconds": 1000}}
-    last, _ = killed(tmp_path, Look(4), **options)
+    last, _ = train_until_cut(tmp_path, Look(4), **options)
     seen.clear()
     fit(tmp_path, Look(), resume=last, **options)
     assert seen[:2] == pytest.approx([0.6, 0.6], abs=0.02)  # 3 x 200 s of 1000 s, not 3 of 16 steps
@@ -243,7 +243,7 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
 
 def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
     """From the first resumed step on, the schedule applies to the new learning rate."""
-    last, _ = killed(tmp_path, Cut(8))
+    last, _ = train_until_cut(tmp_path, Cut(8))
     changed = module()
     changed.optimization = Optimization(
         lr=0.005, warmup=0.1, end_factor=0.0, betas=(0.5, 0.9), freeze_until={"shift": 0.4}
@@ -319,7 +319,7 @@ def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
 def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
     """Seconds and peak memory of a resumed run are those of all its sessions."""
     first, second = TrainingCost(), TrainingCost()
-    last, _ = killed(tmp_path, Cut(13), more=[first])
+    last, _ = train_until_cut(tmp_path, Cut(13), more=[first])
     saved = next(v for k, v in torch.load(last, weights_only=True)["callbacks"].items() if "Cost" in k)
     earlier = saved["time_elapsed"]["train"]
     assert 0 < earlier < first.seconds

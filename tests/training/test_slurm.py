@@ -59,7 +59,7 @@ def task(monkeypatch, tmp_path):
     return requests
 
 
-def stopped_by(number):
+def stop_with(number):
     def train(run, directory, stats):
         (directory / "checkpoints").mkdir()
         (directory / "checkpoints" / "last.ckpt").write_text(str(run.seed))
@@ -73,7 +73,7 @@ def stopped_by(number):
 def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, number):
     """The same command resumes in its directory, instead of starting anew or being rejected. SLURM requeues
     a job that is ended early by itself, and one whose time is up (SIGUSR1) on request."""
-    monkeypatch.setattr(train_verb, "train", stopped_by(number))
+    monkeypatch.setattr(train_verb, "train", stop_with(number))
     code, _, err = call(monkeypatch, capsys, "train", *places)
     assert code == 128 + number
     assert ("SLURM queues its job again" in err) == task.exists() == (number == signal.SIGUSR1)
@@ -91,7 +91,7 @@ def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, n
 
 def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
     """A second command in an interactive job is a new run."""
-    monkeypatch.setattr(train_verb, "train", stopped_by(signal.SIGTERM))
+    monkeypatch.setattr(train_verb, "train", stop_with(signal.SIGTERM))
     assert call(monkeypatch, capsys, "train", "hydra.run.dir=runs/train/1")[0] == 143
     monkeypatch.setattr(train_verb, "train", record_execution)
     assert call(monkeypatch, capsys, "train")[0] == 0
