@@ -25,21 +25,6 @@ def gaussians(n=50, seed=0) -> Gaussians:
     )
 
 
-def test_a_ply_renders_as_what_was_written(tmp_path):
-    """Opacities, scales, colours and the world frame survive the round trip: both render to the same
-    image."""
-    written = gaussians()
-    write_ply(written, tmp_path / "a.ply")
-    read = read_ply(tmp_path / "a.ply")
-    for name in ("means", "scales", "opacities", "colors"):
-        assert torch.allclose(getattr(read, name), getattr(written, name), atol=1e-5)
-    assert torch.allclose(read.quaternions.norm(dim=-1), torch.ones(50), atol=1e-6)
-    cameras = ring(2, 24)[None]
-    a, b = (render(g, cameras, backend="reference").image for g in (written, read))
-    assert a.max() > 0.2
-    assert torch.allclose(a, b, atol=1e-4)
-
-
 def test_the_viewer_of_3d_gaussian_splatting_reads_it(tmp_path):
     """As in SIBR's ``GaussianView.cpp``: the third line contains the count, followed by records of degree
     0."""
@@ -113,6 +98,7 @@ def test_a_ply_says_which_image_its_gaussians_were_made_for(tmp_path, low_pass, 
     assert (read.low_pass, read.antialiased) == (low_pass, antialiased)
     cameras = ring(2, 24)[None]
     a, b = (render(g, cameras, backend="reference").image for g in (written, read))
+    assert a.max() > 0.2
     assert torch.allclose(a, b, atol=1e-4)
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.held_out_sequence import is_contradicted
 from ghgs_capture.agreement import MISSED, Agreement
 from ghgs_capture.backgrounds import Backgrounds
 from ghgs_capture.capture import Capture
@@ -125,36 +124,6 @@ def test_masks_that_fail_are_mended_and_the_others_stay(monkeypatch):
     assert len(rounds) > COUNT
     # Each round has the hulls of its own masks, not of those before they were mended.
     assert all(a is b for masks, hulls in rounds for a, b in zip(masks, hulls, strict=True))
-
-
-def without_half_a_head(mask, inside):
-    rows = np.nonzero(mask.any(1))[0]
-    cut = mask.copy()
-    head = cut[: int(rows[0] + 0.1 * len(rows))]
-    head[:, int(np.nonzero(head)[1].mean()) :] = False
-    return cut
-
-
-@pytest.mark.parametrize(
-    ("change", "fails"),
-    [
-        (lambda mask, inside: mask, False),
-        (without_half_a_head, True),
-        (lambda mask, inside: mask | (inside > 2), True),  # with the background beside limbs
-    ],
-)
-def test_backgrounds_verify_what_the_hull_of_the_others_passes(change, fails):
-    of = figure()
-    shifts = range(-49, 50, 14)
-    seen = [capture(of, str(n), n + 50, np.roll(of.masks, n, 2), n) for n in shifts]
-    backgrounds = Backgrounds.of(seen)
-    for view, camera in enumerate(of.names):
-        inside = Agreement.of(capture(of)).depth_in_others(view)
-        masks = [*of.masks]
-        masks[view] = change(masks[view], inside)
-        given = capture(of, masks=masks)
-        assert not Agreement.of(given).failed[view]
-        assert is_contradicted(given.photographs[view], backgrounds.cameras[camera], inside) == fails
 
 
 def test_a_smaller_photograph_has_its_camera():

@@ -253,11 +253,6 @@ def test_one_line_says_what_is_wrong(place, name):
     assert re.search(r": .*expected .*; found", line)
 
 
-def test_the_right_capture_is_read(place):
-    """What the rows spoil is right before."""
-    assert len(Capture.read(place / "images", place / "images" / "cameras.json").photographs) == 4
-
-
 def another_kind(folder, name):
     path = folder / "cam1.png"
     path.rename(folder / name) if name.startswith("cam1") else (folder / name).touch()

@@ -128,11 +128,6 @@ def test_own_json_has_the_size_of_photographs(tmp_path):
     assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}
 
 
-def test_entries_beside_cameras_are_named(tmp_path):
-    with pytest.warns(UserWarning, match="entries that are not read: units"):
-        check(write(tmp_path / "cameras.json", {"cameras": lists(), "units": "metre"}))
-
-
 @pytest.mark.parametrize("place", ["", "intri.yml", "extri.yml"])
 def test_easymocap(tmp_path, place):
     """Both the rotation vector R and the matrix Rot are written; numbers are names, too."""

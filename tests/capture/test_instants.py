@@ -47,28 +47,6 @@ def test_a_part_of_a_sequence(place, part, chosen, kind):
     assert [int(name) for name in folder.instants] == list(chosen)
 
 
-def test_photographs_that_are_missing_or_broken_in_some_instants(place, capsys):
-    folder = instants(place)
-    (folder / "001" / "cam2.png").unlink()
-    truncate(folder / "002" / "cam1.png")
-    for name in ("cam0", "cam1", "cam2"):
-        (folder / "004" / f"{name}.png").unlink()
-    found = all_numbers(CaptureFolder(folder, place / "cameras.json"))
-    assert found == {
-        "000": alike(0),
-        "001": alike(1, ["cam0", "cam1", "cam3"]),
-        "002": alike(2, ["cam0", "cam2", "cam3"]),
-        "003": alike(3),
-        "005": alike(5),
-    }
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "instant 001 is without cam2: there is no photograph"
-    assert lines[1].startswith("instant 002 is without cam1: ")
-    assert "cam1.png: expected a readable image" in lines[1]
-    assert lines[2].startswith("instant 004 is left out: ")
-    assert len(lines) == 3
-
-
 def test_a_single_instant_of_a_sequence_is_refused_as_one(place):
     folder = instants(place)
     truncate(folder / "002" / "cam1.png")

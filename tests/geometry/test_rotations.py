@@ -49,10 +49,11 @@ def test_a_direction_and_its_gradient_do_not_depend_on_the_length(length):
     torch.testing.assert_close(gradient * length, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_zero_stays_zero_without_a_gradient():
+@pytest.mark.parametrize("least", [(), (0.1,)])
+def test_zero_stays_zero_without_a_gradient(least):
     """0 has no direction, and its gradient must not be NaN."""
     x = torch.zeros(2, 4, requires_grad=True)
-    y = unit(x, 0.1)
+    y = unit(x, *least)
     y.sum().backward()
     assert (y == 0).all()
     assert (x.grad == 0).all()

@@ -115,17 +115,6 @@ def test_a_quick_look_tells_exact_cameras_from_others():
     assert not any(distances.any() for distances in contradiction(nothing))
 
 
-def test_elements_are_corrected_as_if_alone():
-    truth = figure(batch=2)
-    wrong = off(truth, 2.0, (0, 5))
-    together, _, _ = coherent_cameras(wrong)
-    for b in range(2):
-        parts = (wrong.images[[b]], wrong.masks[[b]], wrong.cameras[[b]])
-        alone, _, _ = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
-        torch.testing.assert_close(alone.extrinsics[0], together.extrinsics[b], rtol=0, atol=1e-6)
-        torch.testing.assert_close(alone.intrinsics[0], together.intrinsics[b], rtol=0, atol=1e-4)
-
-
 def test_half_precision_of_others_changes_nothing():
     """Geometry is in float32 under any autocast."""
     wrong = off(figure(), 6.0, (0,))

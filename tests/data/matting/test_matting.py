@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter, zoom
-from scipy.spatial.distance import cdist
 
 from ghgs_capture import Capture, crops
 from ghgs_lit.data import matting
-from ghgs_lit.data.matting import FARTHEST, MattingNetwork, _insideness, _near, refined_matte
+from ghgs_lit.data.matting import MattingNetwork, _insideness, _near, refined_matte
 from ghgs_lit.geometry.masks import signed_distance
 from tests.helpers.figures import Figure
 
@@ -76,16 +75,6 @@ def test_training_pulls_from_beyond_0_and_1(network):
     assert found.min() < 0 or found.max() > 1
     (found - mattes).abs().sum().backward()
     assert all(weight.grad.isfinite().all() for weight in network.parameters())
-
-
-def test_insideness_is_the_distance_from_the_outline():
-    """Distances from the outline, half-way between pixels, equal those from all pairs of pixels."""
-    mask = np.random.default_rng(0).uniform(size=(14, 11)) < 0.5
-    places = np.argwhere(np.ones_like(mask))
-    apart = cdist(places, places)
-    apart[mask.ravel()[:, None] == mask.ravel()] = np.inf
-    expected = (apart.min(1).reshape(mask.shape) - 0.5) * np.where(mask, 1, -1) / FARTHEST
-    np.testing.assert_allclose(_insideness(mask), expected.clip(-1, 1), atol=1e-6)
 
 
 @pytest.mark.parametrize("value", [False, True])

@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.method.heads.dpt import DPTHead, ResidualUnit, _pointwise, add_positions_
 from ghgs_lit.types import Tokens
 
@@ -171,15 +170,6 @@ def test_positions_made_for_inference_serve_training():
     torch.testing.assert_close(found, expected)
     found.sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in head.parameters())
-
-
-def test_unit_of_zero_is_zero_with_a_finite_gradient():
-    """Normalising 0 gives no NaN, forward or backward."""
-    x = torch.tensor([[0.0, 0, 0], [3, 0, 4]], requires_grad=True)
-    y = unit(x)
-    torch.testing.assert_close(y.detach(), torch.tensor([[0.0, 0, 0], [0.6, 0, 0.8]]))
-    y.sum().backward()
-    assert x.grad.isfinite().all()
 
 
 def test_wrong_number_of_layers_is_refused():

@@ -3,10 +3,8 @@
 import dataclasses
 import itertools
 
-import lightning.pytorch as L
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
@@ -14,9 +12,6 @@ from ghgs_lit.losses import terms
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds import NoRounds, RoundsOptions
 from ghgs_lit.rendering import render
-from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.types import Targets
-from tests.helpers.losses import losses_of
 from tests.helpers.models import ATTRIBUTES, close, config, make_model, predict
 from tests.helpers.scenes import make_batch
 
@@ -143,23 +138,6 @@ def test_what_padding_added_is_cut_off_every_round():
     assert found.drafts
     for draft in found.drafts:
         assert torch.equal(draft.pixel, found.gaussians.pixel)
-
-
-def test_validation_shows_what_each_round_is_worth():
-    """PSNR and depth error before each round are logged: those of the whole model if rounds change
-    nothing."""
-    batch = make_batch(1, 3)
-    batch = dataclasses.replace(batch, targets=Targets(batch.images, batch.masks, batch.cameras))
-    trained = GHGSModule(
-        model("rounds.gains=false"), render, losses_of({"render_l1": 1.0}), Optimization(lr=1.0), {}
-    )
-    trainer = L.Trainer(
-        accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False
-    )
-    (found,) = trainer.validate(trained, DataLoader([batch], batch_size=None), verbose=False)
-    for name in ("psnr", "depth_error_mm"):
-        before = [found[f"val/{name}_before_round_{number}"] for number in (1, 2)]
-        assert before == pytest.approx([found[f"val/{name}"]] * 2, rel=1e-4)
 
 
 def test_each_round_changes_half_as_much_as_the_one_before():
