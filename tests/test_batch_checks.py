@@ -45,7 +45,7 @@ def bad_batches():
     }
 
 
-def spoiled(name, index, value):
+def spoil(name, index, value):
     tensor = getattr(make_batch(1, 2), name).clone()
     tensor[index] = value
     return {name: tensor}
@@ -54,12 +54,12 @@ def spoiled(name, index, value):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (spoiled("images", (0, 1, 2, 0, 0), torch.nan), r"batch.images: expected finite .*\[\[0, 1\]\]"),
-        (spoiled("images", (0, 0, 0, 0, 0), torch.inf), r"batch.images: .*\[\[0, 0\]\]"),
-        (spoiled("images", (0, 0, 0, 0, 0), 255.0), r"batch.images: .*within \[0, 1\]"),
-        (spoiled("images", (0, 0, 0, 0, 0), -0.5), r"batch.images: .*within \[0, 1\]"),
-        (spoiled("depths", (0, 1, 3, 3), torch.nan), r"batch.depths: .*\[\[0, 1\]\]"),
-        (spoiled("depths", (0, 1, 3, 3), -1.0), r"batch.depths: expected finite depths"),
+        (spoil("images", (0, 1, 2, 0, 0), torch.nan), r"batch.images: expected finite .*\[\[0, 1\]\]"),
+        (spoil("images", (0, 0, 0, 0, 0), torch.inf), r"batch.images: .*\[\[0, 0\]\]"),
+        (spoil("images", (0, 0, 0, 0, 0), 255.0), r"batch.images: .*within \[0, 1\]"),
+        (spoil("images", (0, 0, 0, 0, 0), -0.5), r"batch.images: .*within \[0, 1\]"),
+        (spoil("depths", (0, 1, 3, 3), torch.nan), r"batch.depths: .*\[\[0, 1\]\]"),
+        (spoil("depths", (0, 1, 3, 3), -1.0), r"batch.depths: expected finite depths"),
         ({"alpha": torch.full((1, 2, 56, 56), 1.2)}, r"batch.alpha: expected finite values within \[0, 1\]"),
         ({"alpha": torch.zeros(1, 2, 56, 28)}, r"batch.alpha: expected .*; found \(1, 2, 56, 28\)"),
         ({"depths": torch.zeros(1, 2, 28, 56)}, r"batch.depths: expected .*; found \(1, 2, 28, 56\)"),
@@ -85,7 +85,7 @@ def test_broken_values_are_refused_where_they_are(changes, message):
 def test_checks_of_values_can_be_left_out():
     """Checks can be disabled for values that are already checked; by default the model rejects invalid
     ones."""
-    bad = dataclasses.replace(make_batch(1, 2), **spoiled("images", (0, 1, 2, 0, 0), torch.nan))
+    bad = dataclasses.replace(make_batch(1, 2), **spoil("images", (0, 1, 2, 0, 0), torch.nan))
     model = make_model("model=paper")
     with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
         predict(model, bad)

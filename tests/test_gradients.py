@@ -64,7 +64,7 @@ def relative(near: Tensor, far: Tensor) -> Tensor:
     return relative_bounds(DepthBounds(near, far), masks)
 
 
-def resized(source: Window, target: Window):
+def resize_to(source: Window, target: Window):
     return lambda maps: source.resize(maps, target)
 
 
@@ -100,8 +100,8 @@ FUNCTIONS = {
         relative,
         (values(1, 1, 3, 4, low=1.0, high=2.0), values(1, 1, 3, 4, low=2.0, high=3.0)),
     ),
-    "resampling of whole maps": (resized(WHOLE, Window.whole((9, 11))), (values(1, 2, 4, 5),)),
-    "resampling of a window": (resized(PART, TARGET), (values(1, 2, 3, 4),)),
+    "resampling of whole maps": (resize_to(WHOLE, Window.whole((9, 11))), (values(1, 2, 4, 5),)),
+    "resampling of a window": (resize_to(PART, TARGET), (values(1, 2, 3, 4),)),
 }
 
 

@@ -28,7 +28,7 @@ from tests.helpers.models import load_model, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 
 
-class Asked(NamedTuple):
+class Counts(NamedTuple):
     """Counts of a prediction, and of a training step with two rounds if the model has rounds."""
 
     launches: int
@@ -41,14 +41,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1313, 1, 2730, 2),
-    ("model=paper", 8): Asked(1341, 1, 2832, 2),
-    ("model=hull", 1): Asked(1526, 1, 2980, 2),
-    ("model=hull", 8): Asked(1554, 1, 3083, 2),
-    ("model=recurrent", 1): Asked(2024, 2, 3743, 3),
-    ("model=recurrent", 8): Asked(2102, 2, 3896, 3),
-    ("shipped", 1): Asked(2128, 2, 3743, 3),
-    ("shipped", 8): Asked(2217, 2, 3896, 3),
+    ("model=paper", 1): Counts(1313, 1, 2730, 2),
+    ("model=paper", 8): Counts(1341, 1, 2832, 2),
+    ("model=hull", 1): Counts(1526, 1, 2980, 2),
+    ("model=hull", 8): Counts(1554, 1, 3083, 2),
+    ("model=recurrent", 1): Counts(2024, 2, 3743, 3),
+    ("model=recurrent", 8): Counts(2102, 2, 3896, 3),
+    ("shipped", 1): Counts(2128, 2, 3743, 3),
+    ("shipped", 8): Counts(2217, 2, 3896, 3),
 }
 
 
@@ -63,7 +63,7 @@ def two_rounds(kind: str) -> GHGS:
     return model
 
 
-def asked(kind: str, size: int) -> Asked:
+def count_launches(kind: str, size: int) -> Counts:
     """Counts for four views of 28 x 28 pixels, or 56 x 56 with the weights that come with the package."""
     model = two_rounds(kind)
     batch = ellipsoid_batch(0.15, 4, 28, size)
@@ -75,15 +75,15 @@ def asked(kind: str, size: int) -> Asked:
             _, launches, waits = device.forward(Predictor(model.eval()), batch, log)["total"]
         parts = device.second_step(model.train(), Optimization(lr=1e-3, matrix_scale=1.0), batch, log)
     step = [sum(numbers) for numbers in zip(*parts.values(), strict=True)]
-    return Asked(launches, waits, *step[1:])
+    return Counts(launches, waits, *step[1:])
 
 
 @pytest.mark.parametrize(("kind", "size"), LIMITS)
 def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
     """Each launch costs the host some 15 microseconds, each synchronization the time until the GPU has
     caught up."""
-    found, limit = asked(kind, size), LIMITS[kind, size]
-    counted = Asked._fields if torch.__version__.startswith(_VERSION) else ("waits", "step_waits")
+    found, limit = count_launches(kind, size), LIMITS[kind, size]
+    counted = Counts._fields if torch.__version__.startswith(_VERSION) else ("waits", "step_waits")
     grown = [name for name in counted if getattr(found, name) > getattr(limit, name)]
     print(f'    ("{kind}", {size}): {found},')
     assert not grown

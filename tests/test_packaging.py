@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 FIND = "from ghgs_lit.config import conf_dir; print(conf_dir())"
 
 
-def found_conf(cwd: Path, pythonpath: Path | None) -> Path:
+def find_conf(cwd: Path, pythonpath: Path | None) -> Path:
     env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     if pythonpath is not None:
         env["PYTHONPATH"] = str(pythonpath)
@@ -42,7 +42,7 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
-    conf = found_conf(tmp_path, site)
+    conf = find_conf(tmp_path, site)
     assert conf == (site / "ghgs_lit" / "conf").resolve()
     assert groups(conf) == groups(REPOSITORY / "conf")
     assert (site / "hydra_plugins" / "ghgs_lit_sweeper.py").is_file()
@@ -55,17 +55,17 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
 
 def test_editable_install(tmp_path):
     """Developers get the checkout's ``conf`` rather than an installed copy."""
-    assert found_conf(tmp_path, None) == REPOSITORY / "conf"
+    assert find_conf(tmp_path, None) == REPOSITORY / "conf"
 
 
 def test_checkout(tmp_path):
     """The package runs from a copy of the repository that is not installed."""
     for name in ("ghgs_lit", "conf"):
         shutil.copytree(REPOSITORY / name, tmp_path / "copy" / name)
-    assert found_conf(tmp_path, tmp_path / "copy") == (tmp_path / "copy" / "conf").resolve()
+    assert find_conf(tmp_path, tmp_path / "copy") == (tmp_path / "copy" / "conf").resolve()
 
 
-def required() -> dict[str, Requirement]:
+def requirements() -> dict[str, Requirement]:
     """Requirements of the package and its extras, by name."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     lines = [
@@ -79,7 +79,7 @@ def test_the_versions_that_make_installs_are_allowed():
     """``constraints.txt`` must not contradict the version ranges of the package."""
     lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
     exact = dict(line.split("==") for line in lines if not line.startswith("#"))
-    known = {name.replace("_", "-"): each for name, each in required().items()}
+    known = {name.replace("_", "-"): each for name, each in requirements().items()}
     assert {"torch", "hydra-core", "pillow"} <= known.keys() & exact.keys()
     for name in known.keys() & exact.keys():
         assert known[name].specifier.contains(exact[name]), name
@@ -90,5 +90,5 @@ def test_the_versions_that_make_installs_are_allowed():
 )
 def test_versions_that_run_what_a_file_says_are_refused(name, unsafe, safe):
     """Older versions unpickle code by default, or call any function named in a logging configuration."""
-    assert not required()[name].specifier.contains(unsafe)
-    assert required()[name].specifier.contains(safe)
+    assert not requirements()[name].specifier.contains(unsafe)
+    assert requirements()[name].specifier.contains(safe)

@@ -54,7 +54,7 @@ def peer(name):
     return model
 
 
-def painted(count, size):
+def paint_features(count, size):
     """Features of cells, a random function of the position on an ellipsoid; with cameras, whole cells and
     true depths."""
     cameras = ring(1, count, size, size)
@@ -77,7 +77,7 @@ def limits(depth, whole):
 def test_correlations_are_those_of_a_literal_loop(stereo):
     """NumPy matrices and SciPy's interpolation in float64, cell by cell; each of 5 cameras has 2
     neighbours."""
-    features, cameras, whole, depth = painted(5, 56)
+    features, cameras, whole, depth = paint_features(5, 56)
     near, far = limits(depth, whole)
     cells = whole.flatten().nonzero()[::7, 0]
     found = stereo.correlations(features, cameras, cells, near, far, 9)
@@ -117,7 +117,7 @@ def test_gradients_are_those_of_finite_differences(stereo):
     """Of correlations with respect to features, of an update and of upsampling with respect to all
     inputs."""
     torch.manual_seed(3)
-    features, cameras, whole, depth = painted(2, 40)
+    features, cameras, whole, depth = paint_features(2, 40)
     near, far = (bound.double() for bound in limits(depth, whole))
     cells = whole.flatten().nonzero()[::9, 0]
     features = features[:, :, :4].double().requires_grad_()

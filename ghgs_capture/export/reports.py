@@ -9,7 +9,7 @@ from typing import Any
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.parsing import read_json
-from ghgs_lit.runs.results import plain
+from ghgs_lit.runs.results import to_json_data
 
 REPORT = "report.json"  #: Name of the report
 
@@ -84,7 +84,7 @@ def _write_report(directory: Path, files: Mapping[str, int | None], report: Mapp
     written = _written_before(directory)
     earlier = [name for name in written if name not in (REPORT, *files) and (directory / name).exists()]
     kept = {"earlier_files": earlier} if earlier else {}
-    text = json.dumps(plain({**report, "files": files, **kept}), indent=1, allow_nan=False)
+    text = json.dumps(to_json_data({**report, "files": files, **kept}), indent=1, allow_nan=False)
     write_text_atomically(directory / REPORT, text)
     return earlier
 

@@ -82,7 +82,7 @@ def with_instants(run: Adapt, directory: Path) -> Adapt:
         data={**run.plain["data"], "root": root, "cameras": cameras},
         targets={**read_option("targets", "cameras"), "per_step": 1},
     )
-    return run.changed(
+    return run.with_changes(
         views={"training_counts": [others], "evaluation_count": others},
         evaluation={"views": [others], "targets": ["cameras"]},
         loss={"weights": {**run.plain["loss"]["weights"], **_WEIGHTS}},
@@ -146,7 +146,7 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     del method  # frees memory for the training
     # Stages are frozen at first only where training starts from random weights.
     seconds = 60 * run.plain["minutes"]
-    limited = run.changed(trainer={"max_time": {"seconds": seconds}}, optimizer={"freeze_until": {}})
+    limited = run.with_changes(trainer={"max_time": {"seconds": seconds}}, optimizer={"freeze_until": {}})
     start = {"init_from": str(file_of(run.checkpoint)), "init_strict": True, "allow_random_encoder": False}
     after = train(Started.of({**limited.plain, **start}), directory, stats)
     if after is None:

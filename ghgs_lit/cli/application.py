@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.cli import messages
 from ghgs_lit.config import VERSION_BASE, compose, conf_dir
-from ghgs_lit.config.compose import check_ablation, plain, store_defaults
+from ghgs_lit.config.compose import check_ablation, store_defaults, to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.options import UnknownKey
 from ghgs_lit.config.reading import read_as_ghgs
@@ -105,17 +105,17 @@ class Verb:
             is_given = any(word.lstrip("+").startswith("overwrite=") for word in self.argv)
             fits = is_given or not cfg.get("overwrite")
             require(fits, "overwrite", "a value on the command line alone", "true in a file")
-            verb = verb_class(self.name).begin(plain(cfg))
+            verb = verb_class(self.name).begin(to_plain(cfg))
             is_dry = getattr(verb, "dry_run", False)
             if verb.begins_run and not is_dry:
                 run = RunDirectory(directory)
                 if run.marker is not None:  # start() compares whole configurations
-                    verb.complete(plain(fill(cfg)))
+                    verb.complete(to_plain(fill(cfg)))
                 run.start(verb)
             if not is_dry:
                 write_hydra_files(cfg, directory)
             verb.require_files()
-            verb.complete(plain(fill(cfg)))  # before slow imports of the verb
+            verb.complete(to_plain(fill(cfg)))  # before slow imports of the verb
             collect_garbage_again()
             let_children_sleep()
             result = verb.run()

@@ -215,7 +215,7 @@ def with_chosen_targets(run: Measured) -> Measured:
     keys = given_keys()
     if "targets" not in keys or is_below("evaluation.targets", keys):
         return run
-    return run.changed(evaluation={"targets": [run.targets.name]})
+    return run.with_changes(evaluation={"targets": [run.targets.name]})
 
 
 def pick_device(name: str) -> torch.device:

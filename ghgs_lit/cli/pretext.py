@@ -46,7 +46,7 @@ def pretrain(run: Training, directory: Path, stats: dict[str, Any]) -> float | N
             size.
     """
     # Shown in tables as the origin of models that start from this checkpoint.
-    run = run.changed(encoder={"weights": "pretext"})
+    run = run.with_changes(encoder={"weights": "pretext"})
     options = run.encoder.semantic
     patch_size = run.encoder.patch_size
     require(options is not None, "encoder.semantic", "the options of a branch to train", None)

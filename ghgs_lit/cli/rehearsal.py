@@ -36,7 +36,7 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for run in distinct.values():
-            findings.check(run.changed(data={"workers": 0}), Path(folder))
+            findings.check(run.with_changes(data={"workers": 0}), Path(folder))
     return Rehearsal(_summarize(findings.reasons), list(findings.notes))
 
 

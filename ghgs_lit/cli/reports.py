@@ -12,7 +12,7 @@ from tabulate import tabulate
 
 from ghgs_lit.cli.runtime import announce
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.results import plain
+from ghgs_lit.runs.results import to_json_data
 
 Tables = dict[str, pd.DataFrame]  #: Tables of texts by their titles
 
@@ -88,7 +88,7 @@ def publish(
         parts += [f"## {title}", table.to_markdown(index=False, disable_numparse=True)]
     write_text_atomically(directory / f"{command}.md", "\n\n".join(parts) + "\n")
     path = directory / f"{command}.json"
-    write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+    write_text_atomically(path, json.dumps(to_json_data(content), indent=1, allow_nan=False) + "\n")
     announce(path)
     for line in failures:
         print(f"ghgs {command}: {line}", file=sys.stderr)

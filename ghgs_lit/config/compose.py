@@ -109,10 +109,10 @@ def run_of(verb: str, overrides: Sequence[str] = ()) -> Run:
         HydraException: An override does not fit.
         InputError: A value is missing or has a wrong type or range.
     """
-    return verb_class(verb).of(plain(compose(verb, overrides)))
+    return verb_class(verb).of(to_plain(compose(verb, overrides)))
 
 
-def plain(cfg: DictConfig) -> dict[str, Any]:
+def to_plain(cfg: DictConfig) -> dict[str, Any]:
     """Convert a composed configuration to plain data, groups first, without validation.
 
     Raises:

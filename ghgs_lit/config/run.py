@@ -115,7 +115,7 @@ class Run(Options):
         """The whole configuration as saved, in plain data; must not be modified."""
         return self._plain
 
-    def changed(self, **nodes: Mapping[str, Any]) -> Self:
+    def with_changes(self, **nodes: Mapping[str, Any]) -> Self:
         """Return a copy with some keys of nodes changed; the result is validated.
 
         Args:

@@ -10,7 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ghgs_lit.config.compose import plain
+from ghgs_lit.config.compose import to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.run import Run
@@ -54,7 +54,7 @@ def register_resolvers() -> None:
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
-        return config_hash(plain(fill(OmegaConf.masked_copy(_root_, keys))))
+        return config_hash(to_plain(fill(OmegaConf.masked_copy(_root_, keys))))
 
     def run_of_job(name: str, *, _root_: DictConfig) -> str:
         if not is_queued_again():

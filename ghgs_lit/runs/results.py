@@ -75,14 +75,14 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     return summary
 
 
-def plain(value: Any) -> Any:
+def to_json_data(value: Any) -> Any:
     """Convert a value to plain data for JSON: keys become text; infinities and NaN become None."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_json_data(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
+        return [to_json_data(v) for v in value]
     return value
 
 
@@ -115,7 +115,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     table = io.StringIO()
     writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in plain(rows))
+    writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in to_json_data(rows))
     write_text_atomically(directory / "metrics.csv", table.getvalue())
     content = {
         "format_version": FORMAT_VERSION,
@@ -124,7 +124,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
         "rows": rows,
     }
     path = directory / "metrics.json"
-    write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False))
+    write_text_atomically(path, json.dumps(to_json_data(content), indent=1, allow_nan=False))
     return path
 
 

@@ -18,7 +18,7 @@ from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from ghgs_lit.config.compose import check_ablation, chosen_options, plain, saved_text
+from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text, to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.registry import verb_class
@@ -144,7 +144,7 @@ def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> l
             cfg.hydra.job.num = len(planned)
             subdirectory = str(cfg.hydra.sweep.subdir)
             hydra_node = cfg.pop("hydra")
-        run = verb.of(plain(fill(cfg)))
+        run = verb.of(to_plain(fill(cfg)))
         run = run.replace(chosen=chosen_options(run.plain, hydra_node))
         name = config_hash(run.plain)
         # The job writes to the planned directory, whatever job number the launcher assigns.

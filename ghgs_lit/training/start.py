@@ -131,7 +131,7 @@ def with_origin(run: "Train", model: nn.Module) -> "Train":
             fits &= name in state and state[name].shape == tensor.shape
     if not origin or not fits:
         return run
-    return run.changed(encoder={"weights": origin})
+    return run.with_changes(encoder={"weights": origin})
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:

@@ -10,7 +10,7 @@ from omegaconf import open_dict
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.application import _rewrite_overrides
 from ghgs_lit.config import compose, run_of
-from ghgs_lit.config.compose import plain
+from ghgs_lit.config.compose import to_plain
 from ghgs_lit.config.registry import class_of, verb_class
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.model import GHGS
@@ -36,7 +36,7 @@ def composed(monkeypatch):
         monkeypatch.setattr(HydraConfig.instance(), "cfg", copy.deepcopy(cfg))
         with open_dict(cfg):
             del cfg["hydra"]
-        return verb_class(verb).of(plain(cfg))
+        return verb_class(verb).of(to_plain(cfg))
 
     return composed
 

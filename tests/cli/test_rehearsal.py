@@ -29,7 +29,7 @@ def rendered(tmp_path_factory):
     return str(folder / "rendered")
 
 
-def rehearsed(*overrides):
+def rehearse(*overrides):
     return rehearsal.rehearse([run_of("train", [*SMALL, *overrides])])
 
 
@@ -38,7 +38,7 @@ def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setitem(sys.modules, "torchvision", None)
     monkeypatch.setitem(sys.modules, "wandb", None)
-    found = rehearsed(
+    found = rehearse(
         "init_from=none.ckpt", "resume=gone.ckpt", f"data.root={tmp_path / 'none'}", "trainer=gpu",
         "encoder.layers=[1,2,3]", "metrics.lpips=require", "logger=wandb",
     )  # fmt: skip
@@ -79,7 +79,7 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     shutil.copytree(rendered, "bare", ignore=shutil.ignore_patterns("bodies", "smpl*"))
     write_checkpoint("other.ckpt", {"encoder.nothing": torch.ones(2)}, config())
-    found = rehearsed(f"data.root={rendered}", *overrides)
+    found = rehearse(f"data.root={rendered}", *overrides)
     assert len(found.reasons) == 1
     assert re.search(expected, found.reasons[0]), found.reasons
 
@@ -91,8 +91,8 @@ def test_weights_of_another_size_are_a_note(tmp_path, rendered):
     model = GHGS.from_config(run_of("train", [*SMALL, *small]).plain)
     write_checkpoint(path, model.state_dict(), config())
     weights = [f"data.root={rendered}", f"init_from={path}", *small]
-    assert not [note for note in rehearsed(*weights).notes if "init_from" in note]
-    found = rehearsed(*weights, "encoder.width=64")
+    assert not [note for note in rehearse(*weights).notes if "init_from" in note]
+    found = rehearse(*weights, "encoder.width=64")
     assert not found.reasons
     (note,) = (note for note in found.notes if note.startswith("init_from"))
     assert re.fullmatch(rf"init_from: \d+ of \d+ tensors have another shape in {path}, and .*", note)
@@ -103,7 +103,7 @@ def test_the_room_for_tokens_is_said(rendered):
     two bytes."""
     encoder = "encoder={width: 32, heads: 2, depth: 4, layers: [0, 1, 2, 3], image_size: 28}"
     frozen = ["encoder=vggt_1b", encoder, "encoder.vit={depth: 2, heads: 2}", "allow_random_encoder=true"]
-    found = rehearsed(
+    found = rehearse(
         f"data.root={rendered}",
         "feature_cache.kind=disk",
         "feature_cache.folder=features",

@@ -41,7 +41,7 @@ def test_what_is_not_said_is_the_default():
     assert json.loads(read.model_dump_json()) == {"must": 1, "size": [140, 140], **nested}
 
 
-def restated(values, defaults, path):
+def find_restated(values, defaults, path):
     said = flatten(defaults)
     return [f"{path}: {key}" for key, value in flatten(values).items() if key in said and said[key] == value]
 
@@ -57,7 +57,7 @@ def test_no_option_restates_a_default(group):
             continue
         for key, node in nodes_of({group: content}):
             if "kind" in node or None in KINDS[group]:
-                wrong += restated(node, with_defaults({}, class_of_node(node, key)), path.stem)
+                wrong += find_restated(node, with_defaults({}, class_of_node(node, key)), path.stem)
     referred = ("synthetic: size", "random: evaluation_count")
     assert [key for key in wrong if key not in referred and not key.endswith(": name")] == []
 
@@ -66,7 +66,7 @@ def test_no_option_restates_a_default(group):
 def test_no_verb_restates_a_default(verb):
     content = yaml.safe_load((conf_dir() / f"{verb}.yaml").read_text())
     own = {name: value for name, value in content.items() if name in verb_class(verb).model_fields}
-    assert restated(own, with_defaults({}, verb_class(verb)), verb) == []
+    assert find_restated(own, with_defaults({}, verb_class(verb)), verb) == []
 
 
 @pytest.mark.parametrize("group", sorted(KINDS))

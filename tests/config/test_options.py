@@ -20,7 +20,7 @@ TYPED = [(group, kind) for group, kinds in KINDS.items() for kind in kinds]
 
 
 @functools.cache
-def shipped(group):
+def shipped_nodes(group):
     """Nodes of a group in all shipped configurations, as plain data."""
     files = sorted((conf_dir() / group).glob("*.yaml"))
     configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
@@ -52,7 +52,7 @@ def test_every_field_is_set_by_a_shipped_file():
     """A field that no file sets is a constant, or a key that nobody finds."""
     missing = []
     for group, kind in TYPED:
-        nodes = [node for node in shipped(group) if kind is None or node.get("kind") == kind]
+        nodes = [node for node in shipped_nodes(group) if kind is None or node.get("kind") == kind]
         keys = {key for node in nodes for key in flatten(node)}
         keys |= {key[:end] for key in keys for end, sign in enumerate(key) if sign == "."}
         missing += [(group, kind, name) for name in fields(class_of(group, kind, group)) if name not in keys]

@@ -106,7 +106,7 @@ def plans_alone(monkeypatch):
     rehearse_nothing(monkeypatch)
 
 
-def written(folder, files):
+def write_files(folder, files):
     for name, text in files.items():
         path = folder / "conf" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -122,7 +122,7 @@ def test_what_a_file_says_to_hydra_is_held_to_a_list(monkeypatch, capsys, tmp_pa
     """Regression: ``env_set: {GHGS_PLUGINS: ...}`` in a file executed its code, and callbacks called
     functions."""
     files, message = REFUSED[case]
-    flags = [*written(tmp_path, files), f"hydra.run.dir={tmp_path / 'run'}"]
+    flags = [*write_files(tmp_path, files), f"hydra.run.dir={tmp_path / 'run'}"]
     # A file chosen only by the second job is read when the grid is planned.
     grid = ["-m", "experiment=demo,x", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     chosen = ["experiment=x"] if mode == "single" else grid
@@ -146,7 +146,7 @@ def test_a_file_may_say_where_what_and_how_many(monkeypatch, capsys, tmp_path):
     launcher = "defaults: [joblib, _self_]\nn_jobs: 2\n"
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra cluster is not installed")
     files = {"sweep/x": GLOBAL + sweep.replace("FOLDER", str(tmp_path)), "hydra/launcher/y": launcher}
-    flags = written(tmp_path, files)
+    flags = write_files(tmp_path, files)
     data = ["data=scans", "hydra/launcher=y", "+hydra.job.env_set.A=b"]
     code, out, err = call(monkeypatch, capsys, "train", *flags, *data, "sweep=x", "dry_run=true")
     assert (code, err) == (0, "")
@@ -160,7 +160,7 @@ def test_a_file_may_say_where_what_and_how_many(monkeypatch, capsys, tmp_path):
 def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_path):
     """``hydra.searchpath`` and ``--config-path`` reach the same files in other ways."""
     files, message = REFUSED["environment"]
-    folder = written(tmp_path, files)[1]
+    folder = write_files(tmp_path, files)[1]
     flags = [f"hydra.searchpath=[{folder}]", f"hydra.run.dir={tmp_path / 'run'}"]
     code, _, err = call(monkeypatch, capsys, "train", *flags, "experiment=x")
     assert code == 1
@@ -188,7 +188,7 @@ def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_p
 )
 def test_a_file_that_is_no_plain_yaml_is_refused(monkeypatch, capsys, tmp_path, text, message):
     """Aliases in a loop, a few hundred bytes that expand to a billion values, and other encodings."""
-    flags = written(tmp_path, {"experiment/x": GLOBAL})
+    flags = write_files(tmp_path, {"experiment/x": GLOBAL})
     with open(tmp_path / "conf" / "experiment" / "x.yaml", "ab") as file:
         file.write(text if isinstance(text, bytes) else text.encode())
     code, _, err = call(
@@ -201,6 +201,6 @@ def test_a_file_that_is_no_plain_yaml_is_refused(monkeypatch, capsys, tmp_path, 
 
 def test_a_byte_order_mark_is_no_part_of_a_file(monkeypatch, capsys, tmp_path):
     """Editors on Windows write one, also before the ``@package`` line."""
-    flags = written(tmp_path, {"experiment/x": "\ufeff" + GLOBAL + "seed: 7"})
+    flags = write_files(tmp_path, {"experiment/x": "\ufeff" + GLOBAL + "seed: 7"})
     code, out, _ = call(monkeypatch, capsys, "train", *flags, "experiment=x", "--cfg", "job")
     assert (code, OmegaConf.create(out).seed) == (0, 7)

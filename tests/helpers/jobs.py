@@ -9,7 +9,7 @@ import hydra
 
 from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir, run_of
-from ghgs_lit.config.compose import plain
+from ghgs_lit.config.compose import to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.reading import reading_as_ghgs
 from ghgs_lit.config.registry import verb_class
@@ -52,7 +52,9 @@ def executed(sweep: Path) -> list[str]:
 
 def job(cfg) -> float | str | None:
     """The job of a launcher: the verb without training; ``data.workers`` loads data, as in training."""
-    return train_once(RunDirectory(output_dir()), verb_class("train").of(plain(fill(cfg))), load_and_record)
+    return train_once(
+        RunDirectory(output_dir()), verb_class("train").of(to_plain(fill(cfg))), load_and_record
+    )
 
 
 def load_and_record(run: Run, directory: Path, stats: dict[str, Any]) -> float:

@@ -41,7 +41,7 @@ def train_to(checkpoint: bool, seen: list):
     return train
 
 
-def killed(path, run=RUN, checkpoint=True) -> list:
+def train_until_killed(path, run=RUN, checkpoint=True) -> list:
     """Train in a directory until the process is killed; returns the checkpoints it resumed from."""
     seen = []
     with pytest.raises(Killed):
@@ -49,7 +49,7 @@ def killed(path, run=RUN, checkpoint=True) -> list:
     return seen
 
 
-def finished(path, run=RUN) -> float:
+def train_to_end(path, run=RUN) -> float:
     return job.train_once(RunDirectory(path), run, record_execution)
 
 
@@ -57,18 +57,18 @@ def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
     """A batch system that requeues a job repeats its command: nothing is rejected and nothing is lost."""
     path = tmp_path / "run"
     last = str(path / "checkpoints" / "last.ckpt")
-    assert killed(path, checkpoint=False) == [None]
-    assert killed(path) == [None]
+    assert train_until_killed(path, checkpoint=False) == [None]
+    assert train_until_killed(path) == [None]
     identity = RunDirectory(path).marker
-    assert killed(path) == [last]
-    assert finished(path) == 20.5
+    assert train_until_killed(path) == [last]
+    assert train_to_end(path) == 20.5
     assert [s["resumed"] for s in RunDirectory(path).sessions()] == [
         None,
         None,
         *["checkpoints/last.ckpt"] * 2,
     ]
     assert "done before" not in capsys.readouterr().out
-    assert finished(path) == 20.5  # not trained again
+    assert train_to_end(path) == 20.5  # not trained again
     assert f"done before: {path}" in capsys.readouterr().out
     assert len(RunDirectory(path).sessions()) == 4
     assert RunDirectory(path).marker == identity
@@ -77,17 +77,17 @@ def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
 def test_what_is_trained_again_leaves_no_logs_of_before(tmp_path):
     """Regression: a kill before the first checkpoint left event files, so that the same steps were logged
     twice."""
-    killed(tmp_path / "run", checkpoint=False)
+    train_until_killed(tmp_path / "run", checkpoint=False)
     (tmp_path / "run" / EVENTS).rename(tmp_path / "run" / f"{EVENTS}.x")
-    killed(tmp_path / "run", checkpoint=False)
+    train_until_killed(tmp_path / "run", checkpoint=False)
     assert os.listdir(tmp_path / "run" / "tensorboard") == [Path(EVENTS).name]
 
 
 def test_a_moved_run_goes_on(tmp_path):
     """No file of a run contains the path of its directory."""
-    killed(tmp_path / "run")
+    train_until_killed(tmp_path / "run")
     shutil.move(tmp_path / "run", tmp_path / "moved")
-    assert killed(tmp_path / "moved") == [str(tmp_path / "moved" / "checkpoints" / "last.ckpt")]
+    assert train_until_killed(tmp_path / "moved") == [str(tmp_path / "moved" / "checkpoints" / "last.ckpt")]
     named = [
         p for p in (tmp_path / "moved").rglob("*") if p.is_file() and str(tmp_path).encode() in p.read_bytes()
     ]
@@ -97,12 +97,12 @@ def test_a_moved_run_goes_on(tmp_path):
 @pytest.mark.parametrize("is_done", [False, True])
 def test_two_configurations_do_not_share_a_directory(tmp_path, is_done):
     """Regression: the second one was reported as "done before" and never trained."""
-    finished(tmp_path / "run") if is_done else killed(tmp_path / "run")
+    train_to_end(tmp_path / "run") if is_done else train_until_killed(tmp_path / "run")
     before = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
     with pytest.raises(
         InputError, match=r"run: expected a directory without a run; found .* \(.*overwrite=true"
     ):
-        killed(tmp_path / "run", RUN.replace(seed=2))
+        train_until_killed(tmp_path / "run", RUN.replace(seed=2))
     after = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
     assert after == before
     other = RunDirectory(tmp_path / "run").of(RUN.replace(seed=2))
@@ -123,21 +123,25 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
 def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
     """A shorter budget lets a run finish; results of a complete run are not replaced silently."""
     longer = RUN.replace(trainer={**RUN.plain["trainer"], "max_steps": 8})
-    killed(tmp_path / "run")
-    assert killed(tmp_path / "run", longer) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
-    assert finished(tmp_path / "run", longer) == 20.5
+    train_until_killed(tmp_path / "run")
+    assert train_until_killed(tmp_path / "run", longer) == [
+        str(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    ]
+    assert train_to_end(tmp_path / "run", longer) == 20.5
     with pytest.raises(InputError, match="expected a directory without a run"):
-        finished(tmp_path / "run")
+        train_to_end(tmp_path / "run")
     assert RunDirectory(tmp_path / "run").of(longer).done
 
 
 def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
     """``resume=`` continues the training of a finished run."""
-    finished(tmp_path / "run")
-    killed(tmp_path / "run", RUN.replace(resume=str(tmp_path / "run" / "checkpoints" / "last.ckpt")))
+    train_to_end(tmp_path / "run")
+    train_until_killed(
+        tmp_path / "run", RUN.replace(resume=str(tmp_path / "run" / "checkpoints" / "last.ckpt"))
+    )
     best = str(tmp_path / "run" / "checkpoints" / "best.ckpt")
     changed = RUN.replace(optimizer={**RUN.plain["optimizer"], "lr": 0.1})
-    assert killed(tmp_path / "run", changed.replace(resume=best)) == [best]
+    assert train_until_killed(tmp_path / "run", changed.replace(resume=best)) == [best]
     assert RunDirectory(tmp_path / "run").marker.config_hash == config_hash(changed.plain)
 
 
@@ -147,13 +151,15 @@ def test_a_run_that_began_elsewhere_goes_on_here(tmp_path):
     other = tmp_path / "other.ckpt"
     other.touch()
     from_other = RUN.replace(resume=str(other))
-    assert killed(tmp_path / "run", from_other) == [str(other)]
-    assert killed(tmp_path / "run", from_other) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
-    killed(tmp_path / "second")
+    assert train_until_killed(tmp_path / "run", from_other) == [str(other)]
+    assert train_until_killed(tmp_path / "run", from_other) == [
+        str(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    ]
+    train_until_killed(tmp_path / "second")
     with pytest.raises(InputError, match="expected a directory without a run"):
-        killed(tmp_path / "second", from_other)
+        train_until_killed(tmp_path / "second", from_other)
     with pytest.raises(InputError, match="expected a directory without a run"):
-        killed(tmp_path / "second", RUN.replace(resume=None))
+        train_until_killed(tmp_path / "second", RUN.replace(resume=None))
 
 
 @pytest.mark.parametrize(
@@ -179,12 +185,12 @@ FOREIGN = ("notes.txt", "tensorboard/notes.txt", "pictures/holiday.png", "checkp
 def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
     """The user's files remain, also inside the run's folders; the new run has a new ID."""
     path = tmp_path / "run"
-    killed(path)
+    train_until_killed(path)
     before = RunDirectory(path).marker.id
     for name in FOREIGN:
         (path / name).parent.mkdir(exist_ok=True)
         (path / name).write_text("mine")
-    killed(path, RUN.replace(seed=2, overwrite=True), checkpoint=False)
+    train_until_killed(path, RUN.replace(seed=2, overwrite=True), checkpoint=False)
     assert all((path / name).read_text() == "mine" for name in FOREIGN)
     assert not (path / "checkpoints" / "last.ckpt").exists()
     assert RunDirectory(path).marker.id != before
@@ -195,21 +201,21 @@ def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
 def test_a_title_leads_out_of_no_folder(tmp_path, swept):
     """Regression: overwriting an untrusted run of a sweep emptied the sweep's folder."""
     path = tmp_path / "sweep" / "run"
-    killed(path)
+    train_until_killed(path)
     for folder in (path.parent, path.parent / "tb"):
         folder.mkdir(exist_ok=True)
         (folder / ".run").write_text(RunDirectory(path).marker.id)
         (folder / "events.out.tfevents.9").write_text("mine")
     (path.parent / PLAN).write_text("{}")
     (path / SWEPT).write_text(swept)
-    killed(path, RUN.replace(overwrite=True))
+    train_until_killed(path, RUN.replace(overwrite=True))
     assert (path.parent / "events.out.tfevents.9").exists()
     assert (path.parent / "tb" / "events.out.tfevents.9").exists()
 
 
 @pytest.mark.parametrize("text", ["null", "[1, 2]", '"a"', "{}", '["a\\u0000"]', "["])
 def test_a_damaged_title_is_one_line(verb, tmp_path, text):
-    killed(tmp_path / "run")
+    train_until_killed(tmp_path / "run")
     (tmp_path / PLAN).write_text("{}")
     (tmp_path / "run" / SWEPT).write_text(text)
     code, _, err = verb(f"hydra.run.dir={tmp_path / 'run'}", "overwrite=true")
@@ -236,7 +242,7 @@ def test_nothing_is_written_through_links(verb, tmp_path, place):
 
 def test_overwriting_is_for_the_command_line(verb, tmp_path):
     """Regression: an external file with ``hydra.run.dir`` and ``overwrite`` replaced a run."""
-    killed(tmp_path / "run")
+    train_until_killed(tmp_path / "run")
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     own = f"# @package _global_\nhydra: {{run: {{dir: '{tmp_path / 'run'}'}}}}\noverwrite: true\n"
     (tmp_path / "conf" / "experiment" / "x.yaml").write_text(own)
@@ -248,20 +254,20 @@ def test_overwriting_is_for_the_command_line(verb, tmp_path):
 
 @pytest.mark.parametrize("key", ["init_from", "resume"])
 def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path, key):
-    killed(tmp_path)
+    train_until_killed(tmp_path)
     last = tmp_path / "checkpoints" / "last.ckpt"
     run = RUN.replace(overwrite=True, **{key: str(last)})
     if key == "init_from":
         with pytest.raises(InputError, match="init_from: expected a file outside the run"):
-            killed(tmp_path, run)
+            train_until_killed(tmp_path, run)
     else:
-        assert killed(tmp_path, run) == [str(last)]
+        assert train_until_killed(tmp_path, run) == [str(last)]
     assert last.exists()
 
 
 def test_nothing_is_deleted_without_the_lock(tmp_path):
     """Two processes started at the same time must decide one after the other."""
-    killed(tmp_path)
+    train_until_killed(tmp_path)
     with pytest.raises(RuntimeError, match="claimed"):
         RunDirectory(tmp_path).begin(RUN.replace(overwrite=True))
     assert (tmp_path / "checkpoints" / "last.ckpt").exists()
@@ -271,12 +277,12 @@ def test_a_job_that_is_queued_again_does_not_overwrite_itself(tmp_path, monkeypa
     """The command of a requeued job still contains ``overwrite=true``."""
     run = RUN.replace(overwrite=True)
     monkeypatch.setenv("SLURM_JOB_ID", "77")
-    assert killed(tmp_path, run) == [None]
-    assert killed(tmp_path, run) == [None]
+    assert train_until_killed(tmp_path, run) == [None]
+    assert train_until_killed(tmp_path, run) == [None]
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert killed(tmp_path, run) == [str(tmp_path / "checkpoints" / "last.ckpt")]
+    assert train_until_killed(tmp_path, run) == [str(tmp_path / "checkpoints" / "last.ckpt")]
     monkeypatch.setenv("SLURM_JOB_ID", "78")
-    assert killed(tmp_path, run) == [None]
+    assert train_until_killed(tmp_path, run) == [None]
 
 
 @pytest.mark.parametrize("text", ["[]", "{", '{"id": "a"}'])
@@ -284,7 +290,7 @@ def test_a_marker_of_another_program_is_refused(tmp_path, text):
     (tmp_path / MARKER).write_text(text)
     (tmp_path / "pictures").mkdir()
     with pytest.raises(InputError, match=r"run\.json"):
-        killed(tmp_path, RUN.replace(overwrite=True))
+        train_until_killed(tmp_path, RUN.replace(overwrite=True))
     assert (tmp_path / "pictures").exists()
 
 

@@ -241,7 +241,7 @@ def test_time_budgets(value, seconds):
     assert time_budget(TrainerOptions(max_time=value)) == seconds
 
 
-def composed(*overrides: str):
+def compose_train(*overrides: str):
     return compose("train", overrides, with_hydra=True)
 
 
@@ -256,7 +256,7 @@ def composed(*overrides: str):
 )
 def test_named_sweeps(name, count, data):
     """The paper's tables require exactly these runs."""
-    cfg = composed(f"sweep={name}")
+    cfg = compose_train(f"sweep={name}")
     assert cfg.hydra.mode.name == "MULTIRUN"
     assert cfg.data.name == data
     assert cfg.model.name == "paper"

@@ -13,7 +13,7 @@ from ghgs_lit.training.loggers import TensorBoardOptions
 SHARED = ("experiment=demo", "data.root=a/b", "evaluation.views=[3,4]")
 
 
-def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
+def plan_grid(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
     """Directories of a grid's runs, each given as ``ablation=full seed=1``, after its plan is written."""
     items = []
     for text in grid:
@@ -25,7 +25,7 @@ def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
 
 def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
     """TensorBoard files lie in folders of these names below the sweep's; seeds are always included."""
-    runs = planned(tmp_path, "ablation=full seed=1", "ablation=neither seed=1", "+optimizer.lr=0.1 seed=1")
+    runs = plan_grid(tmp_path, "ablation=full seed=1", "ablation=neither seed=1", "+optimizer.lr=0.1 seed=1")
     expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "lr=0.1,seed=1"]
     assert [run.title for run in runs] == expected
     logs = [TensorBoardOptions().build(str(run.path)).log_dir for run in runs]
@@ -34,19 +34,19 @@ def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
 
 def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
     """Also if the larger grid would add keys to it; other settings with the same title get their hash."""
-    (first,) = planned(tmp_path, "seed=1", shared=("ablation=full",))
+    (first,) = plan_grid(tmp_path, "seed=1", shared=("ablation=full",))
     assert first.title == "ablation=full,seed=1"
-    again, other = planned(tmp_path, "seed=1", "seed=2", shared=("ablation=full",))
+    again, other = plan_grid(tmp_path, "seed=1", "seed=2", shared=("ablation=full",))
     assert (again.title, other.title) == (first.title, "seed=2")
-    (twin,) = planned(tmp_path, "seed=2 trainer=gpu", shared=())
-    (third,) = planned(tmp_path, "seed=2", shared=())
+    (twin,) = plan_grid(tmp_path, "seed=2 trainer=gpu", shared=())
+    (third,) = plan_grid(tmp_path, "seed=2", shared=())
     assert twin.title == "seed=2,trainer=gpu"
     assert third.title == f"seed=2,run={third.path.name}"
 
 
 def test_two_runs_of_one_title_keep_their_curves_apart(tmp_path):
     """A run with the same title from another command does not write into the files of the first."""
-    runs = planned(tmp_path, "seed=1", "seed=2", shared=())
+    runs = plan_grid(tmp_path, "seed=1", "seed=2", shared=())
     for run in runs:
         (run.path / "swept.json").write_text('["seed=1"]')
         with run.claim():
@@ -65,7 +65,7 @@ def test_a_run_of_its_own_has_its_files_in_its_folder(tmp_path):
 def test_names_are_those_of_folders(tmp_path):
     """Titles of a value that is a path, and of a long one."""
     long = "x" * 300
-    runs = planned(tmp_path, "init_from=a/b.ckpt seed=1", f"init_from={long} seed=2", shared=())
+    runs = plan_grid(tmp_path, "init_from=a/b.ckpt seed=1", f"init_from={long} seed=2", shared=())
     assert runs[0].title == "init_from=a_b.ckpt,seed=1"
     assert runs[1].title.endswith("x,seed=2")
     assert len(runs[1].title) == 200

@@ -13,7 +13,7 @@ from torch.utils.data import default_collate
 
 from ghgs_lit.diagnostics.stress.families import F64, FAMILIES, Values
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.results import plain
+from ghgs_lit.runs.results import to_json_data
 
 #: Precisions of the runs; the last two are autocast, with inputs in float32.
 DTYPES = ("float32", "bfloat16", "float16")
@@ -116,7 +116,7 @@ def measure(stage: Stage, family: str, seeds: int, dtypes: Sequence[str] = DTYPE
         worst = int(errors.argmax())
         row = {"stage": stage.name, "family": family, "dtype": dtype, "cases": seeds}
         row |= {"failures": int((errors > stage.factor).sum()), "error": float(errors[worst])}
-        rows.append(plain(row | {"budget": stage.factor, "worst": f"{places[worst]}, seed {worst}"}))
+        rows.append(to_json_data(row | {"budget": stage.factor, "worst": f"{places[worst]}, seed {worst}"}))
     return rows
 
 
