@@ -32,7 +32,7 @@ from ghgs_lit.config.options import image_size
 from ghgs_lit.config.run import Run
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.data.imperfections import draw_backgrounds
+from ghgs_lit.data.imperfections import sample_backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.execution import Predictor
@@ -181,10 +181,10 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
     limits = {k: v * (_LARGER if k in _PIXELS else 1) for k, v in capture.augmentation.items()}
     colors = Augmentation(**{k: v for k, v in limits.items() if k in _COLORS})
     seen, wrong = (
-        augmentation.imperfections(batch, [subject_rng(0, subject)])
+        augmentation.add_imperfections(batch, [subject_rng(0, subject)])
         for augmentation in (colors, Augmentation(**limits))
     )
-    behind = draw_backgrounds(_VIEWS, *batch.masks.shape[2:], subject_rng(1, subject))
+    behind = sample_backgrounds(_VIEWS, *batch.masks.shape[2:], subject_rng(1, subject))
     images = seen.images + (1 - batch.alpha[:, :, None]) * torch.from_numpy(behind).float()
     images[:, 0] **= capture.gamma
     mattes = wrong.masks.float() if capture.masks else batch.alpha

@@ -12,7 +12,7 @@ from ghgs_capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, S
 from ghgs_capture.crops import Photograph
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.photographs import Pixels, fits_stored
-from ghgs_lit.data.mask_checks import twins
+from ghgs_lit.data.mask_checks import find_equal_poses
 from ghgs_lit.data.view import area_image, area_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
@@ -123,7 +123,7 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     """
     views = read_small_views(folder, folder.instants[0] if instant is None else instant)
     given = Hypothesis("the calibration is right as it is", "", views).scored(folder)
-    same = twins({view.name: view.camera.pose for view in views})
+    same = find_equal_poses({view.name: view.camera.pose for view in views})
     if same is None and given.score > 0:
         same = find_copies(given.photographs(folder))
     if same is not None:

@@ -50,7 +50,7 @@ class Capture:
         Args:
             size: (height, width) of the crops in pixels.
             refine_masks: pixels of a crop by which outlines of masks may be wrong; mattes are then
-                estimated from the photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks
+                estimated from the photographs (:func:`ghgs_lit.data.matting.refine_matte`). 0: masks
                 are used unchanged.
 
         Returns:

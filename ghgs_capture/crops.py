@@ -99,12 +99,12 @@ def _refined(
     """Refine the matte of a cut; keeps it, with a warning, if the area would change by more than a factor
     of two."""
     # imported here so that photographs are read while PyTorch is imported
-    from ghgs_lit.data.matting import refined_matte
+    from ghgs_lit.data.matting import refine_matte
 
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
     image = area_image(image, *sides)
     matte = area_image(matte, *sides)
-    subject, refined = refined_matte(image, matte, pixels * sides[0] / size[0])
+    subject, refined = refine_matte(image, matte, pixels * sides[0] / size[0])
     share = (refined > 127).sum() / max((matte > 127).sum(), 1)
     if 0.5 <= share <= 2:
         return subject, refined

@@ -25,7 +25,7 @@ from ghgs_capture.photographs import (
     read_pixels,
 )
 from ghgs_lit.config import nodes
-from ghgs_lit.data.mask_checks import implausible
+from ghgs_lit.data.mask_checks import find_mask_problem
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.runtime.cores import allowed_cores
 
@@ -214,7 +214,7 @@ class CaptureFolder:
         camera = self.file.cameras[name]
         pixels = read_pixels(path) if isinstance(path, Path) else path.pixels()
         matte = self._matte(name, camera, path, pixels)
-        problem = implausible(matte > 127)
+        problem = find_mask_problem(matte > 127)
         if problem is not None:
             mask = self._mask(path) if self.backgrounds is None else None
             raise InputError(f"{mask or path}: {problem}")

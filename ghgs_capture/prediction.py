@@ -80,7 +80,7 @@ def predict(
             (:class:`ghgs_lit.refinement.CameraRefinement`); 0: none; ``auto``: 4 where silhouettes
             contradict one another.
         refine_masks: pixels of a crop by which masks may be wrong; mattes are then searched in the
-            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right; ``auto``:
+            photographs (:func:`ghgs_lit.data.matting.refine_matte`). 0: masks are right; ``auto``:
             4 where photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.

@@ -14,7 +14,7 @@ import trimesh
 from PIL import Image
 
 from ghgs_lit.data.decoding import check_extent, read_vertices
-from ghgs_lit.data.images import listed_formats, read_image
+from ghgs_lit.data.images import limit_formats, read_image
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import find_path, parts_of, require_folder
 from ghgs_people.figures.mesh import Person, TexturedMesh
@@ -140,7 +140,7 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     try:
         if kind != "obj":
             _check_gltf(path, content)
-        with listed_formats():
+        with limit_formats():
             scene = trimesh.load_scene(io.BytesIO(content), kind, beside, process=False)
     except InputError:
         raise

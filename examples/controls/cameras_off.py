@@ -38,7 +38,7 @@ def measure_run(checkpoint: Path, directory: Path, pixels: float) -> None:
     error = Augmentation(calibration=pixels)
 
     def knocked(batch: Batch) -> Batch:
-        return error.imperfections(batch, [subject_rng(0, subject) for subject in batch.subjects])
+        return error.add_imperfections(batch, [subject_rng(0, subject) for subject in batch.subjects])
 
     methods = {"model": dataclasses.replace(method, cameras=knocked)}
     data = inputs.build_data(run)

@@ -19,13 +19,13 @@ from ghgs_lit.config.options import Amount, Count, Options, Positive, Share
 from ghgs_lit.data.imperfections import (
     change_tones,
     cut_subjects,
-    draw_backgrounds,
-    draw_color_gains,
-    draw_tone_powers,
     perturb_cameras,
     perturb_mask,
+    sample_backgrounds,
+    sample_color_gains,
+    sample_tone_powers,
 )
-from ghgs_lit.data.matting import refined_matte
+from ghgs_lit.data.matting import refine_matte
 from ghgs_lit.types import Batch, Cameras
 
 # Keys of random streams, in addition to those of ghgs_lit.data.sampling.
@@ -107,7 +107,7 @@ class Augmentation(Options):
         """Whether steps have inputs or targets of different sizes."""
         return self.sizes is not None or self.target_scale is not None
 
-    def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
+    def sample_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
         """Sample the sizes of the inputs and targets of a step.
 
         Args:
@@ -131,7 +131,7 @@ class Augmentation(Options):
             ] * 2
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
-    def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
+    def augment(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """Apply the imperfections of captures to a batch in a share ``chance`` of the steps.
 
         Args:
@@ -139,7 +139,7 @@ class Augmentation(Options):
             indices: indices of the samples in the run.
 
         Returns:
-            The batch, unchanged in steps without imperfections; otherwise see :meth:`imperfections`.
+            The batch, unchanged in steps without imperfections; otherwise see :meth:`add_imperfections`.
         """
         limits = (self.exposure, self.white_balance, self.gamma, self.cut, self.calibration, *self._of_masks)
         is_last = self.exact_from is not None and step >= self.exact_from
@@ -148,9 +148,9 @@ class Augmentation(Options):
         if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
             return batch
         rngs = [np.random.default_rng([seed, _IMPERFECTIONS, step, index]) for index in indices]
-        return self.imperfections(batch, rngs)
+        return self.add_imperfections(batch, rngs)
 
-    def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
+    def add_imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
         """Apply the imperfections of captures to a batch. Images stay in [0, 1], and no mask becomes
         empty.
 
@@ -167,10 +167,10 @@ class Augmentation(Options):
         alpha = batch.alpha
         if self.exposure or self.white_balance:
             views = masks.shape[1]
-            gains = [draw_color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
+            gains = [sample_color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
             images = (images * torch.from_numpy(np.stack(gains)).to(images)[..., None, None]).clamp(0, 1)
         if self.gamma:
-            powers = np.stack([draw_tone_powers(masks.shape[1], self.gamma, s[5]) for s in streams])
+            powers = np.stack([sample_tone_powers(masks.shape[1], self.gamma, s[5]) for s in streams])
             images = change_tones(images, alpha, torch.from_numpy(powers).to(images))
         if self.calibration:
             wrong = [
@@ -202,7 +202,7 @@ class Augmentation(Options):
         if not has_background:
             # Pixels that the segmentation adds get a matte of 1.
             return images * wrong[:, None], wrong, torch.where(wrong > masks, 1, mattes * wrong)
-        patterns = torch.from_numpy(draw_backgrounds(*masks.shape, behind)).to(images)
+        patterns = torch.from_numpy(sample_backgrounds(*masks.shape, behind)).to(images)
         # Brightened colours may exceed the share of the pixel that they cover.
         photographs = (images + (1 - mattes[:, None]) * patterns).clamp(max=1)
         if not is_refined:
@@ -210,7 +210,7 @@ class Augmentation(Options):
         bytes_ = (255 * photographs).round().byte().movedim(1, -1).numpy()
         pixels = max(1, math.ceil(self.mask_offset + self.mask_ragged))
         pairs = [
-            refined_matte(image, 255 * mask, pixels)
+            refine_matte(image, 255 * mask, pixels)
             for image, mask in zip(bytes_, wrong.byte().numpy(), strict=True)
         ]
         subjects, refined = (

@@ -49,13 +49,13 @@ class TrainingBatches(Dataset):
         """(height, width) in pixels of the inputs and of the targets at a step."""
         fixed = self.photographs.size, self.photographs.target_size
         step_of_class = step // self.sampler.class_steps
-        return self.augmentation.draw_sizes(*fixed, self.sampler.seed, step_of_class)
+        return self.augmentation.sample_sizes(*fixed, self.sampler.seed, step_of_class)
 
     def __getitem__(self, step: int) -> Batch:
         samples = self.sampler.batch(step, self.rank, self.world)
         batch = self.photographs.batch(samples, self.sizes(step), self.depths, target_depths=False)
         indices = self.sampler.indices(step, self.rank, self.world)
-        return self.augmentation.imperfect(batch, self.sampler.seed, step, indices)
+        return self.augmentation.augment(batch, self.sampler.seed, step, indices)
 
 
 class EvaluationBatches(Dataset):

@@ -15,11 +15,11 @@ from ghgs_lit.data.batches import make_loader
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.mask_checks import (
     SEARCH,
-    implausible,
+    find_equal_poses,
+    find_mask_problem,
     make_silhouette,
     measure_height,
     measure_overlap,
-    twins,
 )
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
@@ -127,7 +127,7 @@ class _Readings(Dataset):
             reading.has_body = True
             reading.tall = float(np.ptp(body, axis=0).max())
             reading.iou = measure_overlap(body, view)
-        problem = implausible(view.mask) if reading.iou is None else None
+        problem = find_mask_problem(view.mask) if reading.iou is None else None
         if reading.iou is not None and reading.iou < self.min_iou:
             least = f"IoU of {self.min_iou:.2f} or more"
             problem = f"expected the body in its mask ({least}); found IoU {reading.iou:.2f}"
@@ -209,7 +209,7 @@ def _compare_masks(readings: Sequence[Reading], least: float) -> None:
             by_subject.setdefault(one.name, []).append(one)
     for several in by_subject.values():
         ring = {one.position: one for one in several if one.view == RING_VIEW}
-        pair = twins({position: one.silhouette.extrinsics for position, one in ring.items()})
+        pair = find_equal_poses({position: one.silhouette.extrinsics for position, one in ring.items()})
         if pair is not None:
             twin = ring[pair[1]]
             twin.problem = f"{twin.place}: expected a camera of its own; found that of position {pair[0]}"

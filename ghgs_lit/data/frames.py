@@ -126,9 +126,9 @@ class FrameReader(Reader):
             log.warning("%s: %d of %d sequences of %s are there", folder, len(there), len(sequences), phase)
         if not there:
             some = "such as" if sequences else "beside those of val, such as"
-            self.problem(f"{folder}: expected sequences {some} {example}; found none of {phase}")
+            self.add_problem(f"{folder}: expected sequences {some} {example}; found none of {phase}")
         for name, wanted in there:
-            with self.collecting():
+            with self.collect_problems():
                 found = self.frames_of(folder / name, wanted)
                 self.frames |= {check_name(f"{name}_{frame.number:06d}"): frame for frame in found}
                 if len(found) < len(wanted):

@@ -67,7 +67,7 @@ class HuMManReader(FrameReader):
         super().__init__(data, phase, sequences, "p000455_a000986", strict)
         self._body: Body | None = None
         if data.smpl_model is not None:
-            with self.collecting():
+            with self.collect_problems():
                 self._body = Body(Path(data.smpl_model).expanduser())
 
     def frames_of(self, folder: Path, wanted: range) -> list[Frame]:

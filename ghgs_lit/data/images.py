@@ -50,7 +50,7 @@ def read_image(path: Path) -> Image.Image:
 
 
 @contextlib.contextmanager
-def listed_formats() -> Iterator[None]:
+def limit_formats() -> Iterator[None]:
     """Context in which Pillow opens only images in :data:`FORMATS`, also when other libraries call it."""
     Image.init()
     known = list(Image.ID)

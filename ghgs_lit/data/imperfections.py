@@ -28,7 +28,7 @@ _PATCHES = ((3, 0.35), (12, 0.15), (40, 0.06))
 _NOISE = 0.02  # standard deviation of single pixels
 
 
-def draw_color_gains(
+def sample_color_gains(
     views: int, exposure: float, white_balance: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3"]:
     """Sample factors of stored colours with a geometric mean of 1 over cameras, as images show only
@@ -49,7 +49,7 @@ def draw_color_gains(
     return 2 ** (np.stack((green + red, green, green + blue), -1) / _GAMMA)
 
 
-def draw_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
+def sample_tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
     """Sample powers of stored colours with a geometric mean of 1 over cameras.
 
     Args:
@@ -119,7 +119,7 @@ def perturb_mask(
     return result if result.any() else mask
 
 
-def draw_backgrounds(
+def sample_backgrounds(
     views: int, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3 h w"]:
     """Sample a background for each camera: cloudy patterns of large and small patches.
@@ -176,7 +176,7 @@ def perturb_cameras(
     require(bool((distances > 0).all()), "augmentation.calibration", expected, distances.tolist())
     corners = _corners(masks)
 
-    def moved(errors: Tensor) -> tuple[Tensor, Tensor]:
+    def perturb(errors: Tensor) -> tuple[Tensor, Tensor]:
         """Intrinsics and extrinsics with errors [V, 6], which are approximately in pixels."""
         focal = lenses[:, 1, 1]
         half = max(cameras.height, cameras.width) / 2
@@ -189,23 +189,25 @@ def perturb_cameras(
         lens[:, [0, 1], [0, 1]] *= 1 + errors[:, 5:] / half
         return lens, pose
 
-    points = unproject(corners, distances[:, None].expand(-1, 4), _for_corners(lenses), _for_corners(poses))
+    points = unproject(
+        corners, distances[:, None].expand(-1, 4), _repeat_for_corners(lenses), _repeat_for_corners(poses)
+    )
 
-    def seen(lens: Tensor, pose: Tensor) -> Tensor:
+    def project_corners(lens: Tensor, pose: Tensor) -> Tensor:
         """Projections of the corners; far from the world's origin even those of the true cameras differ
         from ``corners`` by rounding."""
-        return project(points, _for_corners(lens), _for_corners(pose))[0]
+        return project(points, _repeat_for_corners(lens), _repeat_for_corners(pose))[0]
 
-    def size(lens: Tensor, pose: Tensor) -> Tensor:
-        return (seen(lens, pose) - seen(lenses, poses)).square().sum(-1).mean(-1).sqrt()
+    def measure_error(lens: Tensor, pose: Tensor) -> Tensor:
+        return (project_corners(lens, pose) - project_corners(lenses, poses)).square().sum(-1).mean(-1).sqrt()
 
     errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
     for _ in range(3):  # converges fast, as the size is nearly proportional to the errors
-        errors = errors * (wanted / size(*moved(errors)))[:, None]
-    lens, pose = _remove_common_error(cameras, *moved(errors))
-    largest = size(lens, pose).amax()
+        errors = errors * (wanted / measure_error(*perturb(errors)))[:, None]
+    lens, pose = _remove_common_error(cameras, *perturb(errors))
+    largest = measure_error(lens, pose).amax()
     if largest > pixels:
-        lens, pose = _remove_common_error(cameras, *moved(errors * (pixels / largest)))
+        lens, pose = _remove_common_error(cameras, *perturb(errors * (pixels / largest)))
     return Cameras(lens.to(cameras.intrinsics), pose.to(cameras.extrinsics), cameras.height, cameras.width)
 
 
@@ -220,7 +222,7 @@ def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
     return torch.stack(corners).double()
 
 
-def _for_corners(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
+def _repeat_for_corners(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
     return matrices[:, None].expand(-1, 4, -1, -1)
 
 

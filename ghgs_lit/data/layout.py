@@ -153,7 +153,9 @@ class Layout(Reader):
         if names is None:
             other = _positions(self.root / next(p for p in PHASES if p != phase) / "img")
             for name in sorted(stored[phase].keys() & other.keys()):
-                self.problem(f"{self.root}: expected each subject in train or in val; found {name!r} in both")
+                self.add_problem(
+                    f"{self.root}: expected each subject in train or in val; found {name!r} in both"
+                )
         planned = self._complete.plan.get(phase, [])
         wanted = (sorted({*stored[phase], *planned}) if names is None else list(map(composed, names)))[:limit]
         homes = {}
@@ -169,9 +171,11 @@ class Layout(Reader):
                 f"({missing[0]} is missing or half-rendered: render again to finish)"
             )
         for name in missing:
-            self.problem(f"{images / name}_000: expected a whole subject; found none, or a half-rendered one")
+            self.add_problem(
+                f"{images / name}_000: expected a whole subject; found none, or a half-rendered one"
+            )
         if not wanted:
-            self.problem(f"{images}: expected folders <id>_<position>; found none")
+            self.add_problem(f"{images}: expected folders <id>_<position>; found none")
         for name in (n for n in wanted if n not in missing):
             self.subjects[name] = tuple(sorted(stored[homes[name]][name]))
             self._folders[name] = self.root / homes[name]

@@ -33,7 +33,7 @@ def make_silhouette(view: View) -> Silhouette:
     return Silhouette(area_mask(view.mask, *size), intrinsics, view.extrinsics.astype(np.float64))
 
 
-def implausible(mask: np.ndarray) -> str | None:
+def find_mask_problem(mask: np.ndarray) -> str | None:
     """Message if a mask, [h, w] bool and true on the subject, is too small, full or inverted; else None."""
     border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1])).mean()
     if border > _MOST_BORDER:
@@ -53,7 +53,7 @@ def measure_height(silhouettes: Sequence[Silhouette]) -> float:
     return float(np.median([s.extent(focus)[0] for s in silhouettes]))
 
 
-def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
+def find_equal_poses(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
     """Names of the first two equal poses among [4, 4] poses by name; None if all differ."""
     pairs = itertools.combinations(poses, 2)
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)

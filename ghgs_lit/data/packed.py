@@ -75,7 +75,7 @@ class Packs:
 
     def view(self, name: str, position: int, view: int, depth: bool) -> View | None:
         """Read a packed view, at the size of the packed files; arguments as for
-        :meth:`Reader.checked_view`.
+        :meth:`Reader.read_checked_view`.
 
         Returns:
             The view; None: it is not packed, or is packed without the requested depth map.
@@ -116,7 +116,7 @@ class Packs:
         content = {}
         for position, view in itertools.product(self.reader.subjects[name], self.views):
             with contextlib.suppress(InputError):  # raised later, when the view is sampled
-                stored = self.reader.checked_view(name, position, view, self.depths)
+                stored = self.reader.read_checked_view(name, position, view, self.depths)
                 content |= _pack_view(position, view, resize_view(stored, self.size, self.resampling))
         try:
             write_atomically(path, lambda temporary: temporary.write_bytes(save(content)))

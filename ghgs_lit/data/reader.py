@@ -90,7 +90,7 @@ class Reader(ABC):
         """File of a subject's body, which need not exist; a text if an option has to specify it."""
         return f"the body of {name}"
 
-    def checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
+    def read_checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """Read one image with :meth:`read_view`, and check it.
 
         Raises:
@@ -105,7 +105,7 @@ class Reader(ABC):
         return stored
 
     @contextlib.contextmanager
-    def collecting(self) -> Iterator[None]:
+    def collect_problems(self) -> Iterator[None]:
         """Context that collects an InputError in ``problems``, or raises it if the reader is strict."""
         try:
             yield
@@ -114,7 +114,7 @@ class Reader(ABC):
                 raise
             self.problems.append(str(error))
 
-    def problem(self, line: str) -> None:
+    def add_problem(self, line: str) -> None:
         """Raise or collect a problem of the data set.
 
         Args:
@@ -123,7 +123,7 @@ class Reader(ABC):
         Raises:
             InputError: the reader is strict.
         """
-        with self.collecting():
+        with self.collect_problems():
             raise InputError(line)
 
 
@@ -172,7 +172,7 @@ class Photographs:
             size: (height, width) in pixels; None: ``self.size``.
 
         Raises:
-            InputError: see :meth:`Reader.checked_view`.
+            InputError: see :meth:`Reader.read_checked_view`.
         """
         size = size or self.size
         packs = self.packs.get(size) or self.packs.get(None)
@@ -181,10 +181,10 @@ class Photographs:
             return resize_view(packed, size, self.resampling)
 
         def read() -> View:
-            stored = self.reader.checked_view(name, position, view, depth)
+            stored = self.reader.read_checked_view(name, position, view, depth)
             return resize_view(stored, size, self.resampling)
 
-        return self._cached((name, position, view, depth, size), read)
+        return self._read_cached((name, position, view, depth, size), read)
 
     def body(self, name: str) -> np.ndarray | None:
         """Read and check a subject's body, see :meth:`Reader.read_body`.
@@ -199,9 +199,9 @@ class Photographs:
                 check_array(f"{name}: body", vertices, [(None, 3)])
             return vertices
 
-        return self._cached((name,), read)
+        return self._read_cached((name,), read)
 
-    def _cached(self, key: tuple, read: Callable[[], Any]) -> Any:
+    def _read_cached(self, key: tuple, read: Callable[[], Any]) -> Any:
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]

@@ -70,7 +70,7 @@ class ViewProtocol(Options):
     """Input views in training. any: ring cameras in random order. even: evenly spaced from a random start.
     uneven: evenly spaced, then each moved by up to one position, as in captures."""
 
-    def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
+    def sample(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
         """Sample the input positions of a training sample.
 
         Args:
@@ -152,7 +152,7 @@ class TargetProtocol(Options):
         evaluated = {"midway": {RING_VIEW, MIDDLE_VIEW}, "random": set()}.get(self.kind, {self.view})
         return evaluated | set(self.training_views)
 
-    def draw(
+    def sample(
         self, available: Sequence[int], inputs: Sequence[int], count: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
         """Sample different images of ``training_views`` that are not inputs.
@@ -192,7 +192,7 @@ class TargetProtocol(Options):
             return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
         if self.kind == "random":
-            return self.draw(available, inputs, count, rng)
+            return self.sample(available, inputs, count, rng)
         most = f"at most the {len(inputs)} inputs, or all"
         require(count <= len(inputs), "targets.per_subject", most, count)
         if self.kind == "release":
@@ -266,8 +266,8 @@ class TrainingSampler:
         name = names[np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(names))[place]]
         rng = np.random.default_rng([self.seed, _SAMPLE, step, index])
         available = self.subjects[name]
-        inputs = self.views.draw(available, count, self.ring, rng)
-        targets = self.targets.draw(available, inputs, self.targets.per_step, rng)
+        inputs = self.views.sample(available, count, self.ring, rng)
+        targets = self.targets.sample(available, inputs, self.targets.per_step, rng)
         return Sample(name, ring_photos(inputs), targets, (self.targets.name,) * len(targets))
 
 

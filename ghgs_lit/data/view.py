@@ -41,7 +41,7 @@ def area_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
     return _area_means(mask[..., None], height, width)[..., 0] > 0.5 - 1e-6
 
 
-def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
+def resample_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
     """Resize a map of inverse depth by sampling it at the centres of new pixels.
 
     Values are interpolated bilinearly (exact for planes) between those of the four neighbouring pixels
@@ -229,7 +229,7 @@ def resize_view(view: View, size: tuple[int, int] | None, resampling: str = "are
         view,
         image=image(view.image, height, width),
         mask=subject,
-        inverse_depth=None if inverse is None else centered_depth(inverse, height, width) * shown,
+        inverse_depth=None if inverse is None else resample_depth(inverse, height, width) * shown,
         intrinsics=intrinsics.astype(np.float32),
         matte=matte,
     )

@@ -55,7 +55,7 @@ def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
     clean, varied = module(boxes).training_batch(0), Augmentation(**EVERYTHING)
 
     def drawn(seed, step, indices=(6, 7)):
-        return varied.imperfect(clean, seed, step, indices)
+        return varied.augment(clean, seed, step, indices)
 
     first = drawn(0, 3)
     assert equal(first, drawn(0, 3))
@@ -64,11 +64,13 @@ def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
             one, two = (getattr(batch.cameras, name) for batch in (first, other))
             assert (one != two).flatten(1).any(1).all()
         assert (first.images != other.images).flatten(1).any(1).all()
-    sizes = [[varied.draw_sizes((28, 28), (56, 56), seed, step) for step in range(12)] for seed in (0, 0, 1)]
+    sizes = [
+        [varied.sample_sizes((28, 28), (56, 56), seed, step) for step in range(12)] for seed in (0, 0, 1)
+    ]
     assert sizes[0] == sizes[1] != sizes[2]
     sometimes = Augmentation(**IMPERFECT, chance=0.5)
     changed = [
-        [not equal(sometimes.imperfect(clean, seed, step, (0, 1)), clean) for step in range(20)]
+        [not equal(sometimes.augment(clean, seed, step, (0, 1)), clean) for step in range(20)]
         for seed in (0, 0, 1)
     ]
     assert changed[0] == changed[1] != changed[2]
@@ -143,7 +145,7 @@ def test_the_last_part_of_a_run_is_exact(boxes):
         assert equal(first.training_batch(step), (always if step < 2 else clean).training_batch(step))
 
 
-def differing(a, b) -> set[str]:
+def find_differences(a, b) -> set[str]:
     """Names of the fields in which two batches differ."""
     cameras = {
         f"cameras.{name}": (getattr(a.cameras, name), getattr(b.cameras, name))
@@ -171,17 +173,17 @@ def test_each_imperfection_changes_its_part_of_the_inputs_alone(boxes, names, ch
     """Targets, depths and other inputs stay unchanged, and each imperfection acts alone as in combination."""
     chosen = {name: IMPERFECT[name] for name in names}
     clean, batch = (module(boxes, augmentation=a).training_batch(1) for a in ({}, chosen))
-    assert differing(clean, batch) == changed
+    assert find_differences(clean, batch) == changed
     together = module(boxes, augmentation=IMPERFECT).training_batch(1)
     everything = {"images", "masks", "alpha", "cameras.intrinsics", "cameras.extrinsics"}
-    assert differing(clean, together) == everything
+    assert find_differences(clean, together) == everything
     # The matte follows the mask: 0 outside it, and 1 where the mask was enlarged.
     assert not together.alpha[~together.masks].any()
     assert (together.alpha[together.masks & ~clean.masks] == 1).all()
     kept = together.masks & clean.masks
     assert torch.equal(together.alpha[kept], clean.alpha[kept])
     if names == ("calibration",):
-        assert "cameras.extrinsics" not in differing(batch, together)
+        assert "cameras.extrinsics" not in find_differences(batch, together)
     for one in (batch, together):
         assert one.images.min() >= 0
         assert one.images.max() <= 1
@@ -271,15 +273,15 @@ def test_imperfections_do_not_depend_on_batch_mates(boxes):
     batch = module(boxes).training_batch(0)
     augmentation = Augmentation(**IMPERFECT)
 
-    def imperfect(one, seeds):
-        return augmentation.imperfections(one, [np.random.default_rng(seed) for seed in seeds])
+    def perturb(one, seeds):
+        return augmentation.add_imperfections(one, [np.random.default_rng(seed) for seed in seeds])
 
     def element(one, b):
         return Batch(one.images[[b]], one.masks[[b]], one.cameras[[b]], alpha=one.alpha[[b]])
 
-    both = imperfect(batch, (3, 4))
+    both = perturb(batch, (3, 4))
     for b, seed in enumerate((3, 4)):
-        alone = imperfect(element(batch, b), (seed,))
+        alone = perturb(element(batch, b), (seed,))
         assert torch.equal(alone.images[0], both.images[b])
         assert torch.equal(alone.masks[0], both.masks[b])
         assert torch.equal(alone.cameras.extrinsics[0], both.cameras.extrinsics[b])

@@ -34,7 +34,7 @@ ZJU_IMAGE, ZJU_MASK = "Camera_B1/000000.jpg", "mask_cihp/Camera_B1/000000.png"
 HUMMAN_IMAGE, HUMMAN_MASK = (f"kinect_{kind}/kinect_000/000000.png" for kind in ("color", "mask"))
 
 
-def annotated(change):
+def change_annotations(change):
     """A case that changes the content of ``annots.npy``."""
 
     def apply(folder: Path) -> None:
@@ -47,7 +47,7 @@ def annotated(change):
 
 def put_lens(kind: str, value):
     """A case that replaces K, R, T or D of the fourth camera."""
-    return annotated(lambda content: content["cams"][kind].__setitem__(3, value))
+    return change_annotations(lambda content: content["cams"][kind].__setitem__(3, value))
 
 
 def swap(content: dict) -> None:
@@ -55,19 +55,19 @@ def swap(content: dict) -> None:
     cams["R"], cams["T"] = cams["T"], cams["R"]
 
 
-def metres(content: dict) -> None:
+def convert_to_metres(content: dict) -> None:
     content["cams"]["T"] = [t / 1000 for t in content["cams"]["T"]]
 
 
-def named(value: str):
-    return annotated(lambda content: content["ims"][0]["ims"].__setitem__(2, value))
+def rename_photograph(value: str):
+    return change_annotations(lambda content: content["ims"][0]["ims"].__setitem__(2, value))
 
 
-def body(value):
+def replace_body(value):
     return lambda folder: np.save(folder / "new_vertices" / "0.npy", value)
 
 
-def calibrated(change):
+def change_calibration(change):
     """A case that changes the content of ``cameras.json``."""
 
     def apply(folder: Path) -> None:
@@ -80,7 +80,7 @@ def calibrated(change):
 
 def put_kinect(key: str, value):
     """A case that replaces K, R or T of the fourth colour camera."""
-    return calibrated(lambda content: content["kinect_color_003"].__setitem__(key, value))
+    return change_calibration(lambda content: content["kinect_color_003"].__setitem__(key, value))
 
 
 def swap_kinects(content: dict) -> None:
@@ -132,11 +132,17 @@ ZJU_MOCAP = {
         r"annots.npy: expected a pickle of NumPy arrays and plain containers; found posix.system",
     ),
     "no cameras": (
-        annotated(lambda c: c.pop("cams")),
+        change_annotations(lambda c: c.pop("cams")),
         r"annots.npy: expected an entry 'cams'; found \['ims'\]",
     ),
-    "R and T swapped": (annotated(swap), r"annots.npy: camera 0: R: expected an array 3x3; found 3x1"),
-    "fewer lenses": (annotated(lambda c: c["cams"]["D"].pop()), r"expected as many K, D, R and T .* 'D': 22"),
+    "R and T swapped": (
+        change_annotations(swap),
+        r"annots.npy: camera 0: R: expected an array 3x3; found 3x1",
+    ),
+    "fewer lenses": (
+        change_annotations(lambda c: c["cams"]["D"].pop()),
+        r"expected as many K, D, R and T .* 'D': 22",
+    ),
     "NaN camera": (
         put_lens("R", np.full((3, 3), np.nan)),
         r"camera 3: R: expected finite numbers; found NaN or infinity",
@@ -155,25 +161,25 @@ ZJU_MOCAP = {
     ),
     "lens of 3 numbers": (put_lens("D", np.zeros((3, 1))), r"camera 3: D: expected an array 4 or 5; found 3"),
     "metres": (
-        annotated(metres),
+        change_annotations(convert_to_metres),
         r"expected translations T in millimetres; found cameras within \d+ mm .*metres",
     ),
     "a camera less in a frame": (
-        annotated(lambda c: c["ims"][0]["ims"].pop()),
+        change_annotations(lambda c: c["ims"][0]["ims"].pop()),
         r"frame 0: expected a photograph for each of 23 cameras; found 22",
     ),
     "wrong frame number": (
-        named("Camera_B3/000001.jpg"),
+        rename_photograph("Camera_B3/000001.jpg"),
         r"frame 0: expected one frame number for all cameras; found \['000000', '000001'\]",
     ),
     "name without a number": (
-        annotated(
+        change_annotations(
             lambda c: c["ims"].__setitem__(0, {"ims": [f"Camera_B{k}/first.jpg" for k in range(1, 24)]})
         ),
         r"Camera_B1/first.jpg: expected a frame number, .*; found 'first.jpg'",
     ),
     "path that leaves": (
-        named("../../secret/000000.jpg"),
+        rename_photograph("../../secret/000000.jpg"),
         r"frame 0: expected paths below the sequence; found '../../secret/000000.jpg'",
     ),
     "no photograph": (
@@ -189,12 +195,18 @@ ZJU_MOCAP = {
         lambda f: (f / "new_vertices" / "0.npy").unlink(),
         r"new_vertices/0.npy: expected an array 6890x3; found no such file",
     ),
-    "body of another model": (body(np.zeros((10475, 3))), r"0.npy: expected an array 6890x3; found 10475x3"),
+    "body of another model": (
+        replace_body(np.zeros((10475, 3))),
+        r"0.npy: expected an array 6890x3; found 10475x3",
+    ),
     "malicious body": (
-        body(np.array(Malice(), object)),
+        replace_body(np.array(Malice(), object)),
         r"0.npy: expected an array 6890x3; found a file that cannot",
     ),
-    "NaN body": (body(np.full((6890, 3), np.nan)), r"0.npy: expected finite numbers; found NaN or infinity"),
+    "NaN body": (
+        replace_body(np.full((6890, 3), np.nan)),
+        r"0.npy: expected finite numbers; found NaN or infinity",
+    ),
     "no sequence": (shutil.rmtree, r"expected sequences such as CoreView_386; found none of train"),
 }
 
@@ -206,14 +218,17 @@ HUMMAN = {
     ),
     "truncated cameras": (lambda f: truncate(f / "cameras.json"), r"cameras.json: expected the cameras"),
     "a camera missing": (
-        calibrated(lambda c: c.pop("kinect_color_007")),
+        change_calibration(lambda c: c.pop("kinect_color_007")),
         r"cameras.json: kinect_color_007: expected K; found none",
     ),
     "no T": (
-        calibrated(lambda c: c["kinect_color_003"].pop("T")),
+        change_calibration(lambda c: c["kinect_color_003"].pop("T")),
         r"kinect_color_003: expected T; found none",
     ),
-    "R and T swapped": (calibrated(swap_kinects), r"kinect_color_000: R: expected an array 3x3; found 3"),
+    "R and T swapped": (
+        change_calibration(swap_kinects),
+        r"kinect_color_000: R: expected an array 3x3; found 3",
+    ),
     "NaN camera": (
         put_kinect("T", [float("nan")] * 3),
         r"kinect_color_003: T: expected finite numbers; found NaN",
@@ -231,11 +246,11 @@ HUMMAN = {
         r"kinect_color_003: K: expected an array 3x3; found text",
     ),
     "millimetres": (
-        calibrated(lambda c: move(c, 1000)),
+        change_calibration(lambda c: move(c, 1000)),
         r"expected translations T in metres; found cameras \d+ m apart",
     ),
     "all cameras in one place": (
-        calibrated(lambda c: move(c, 0)),
+        change_calibration(lambda c: move(c, 0)),
         r"expected translations T in metres; found cameras 0 m",
     ),
     "no photographs": (

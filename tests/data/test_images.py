@@ -9,7 +9,7 @@ from PIL import EpsImagePlugin, ExifTags, Image
 
 from ghgs_capture.photographs import read_pixels
 from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics, read_map, read_photograph
-from ghgs_lit.data.images import listed_formats, read_image
+from ghgs_lit.data.images import limit_formats, read_image
 from ghgs_lit.data.reader import Photographs, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError
@@ -164,7 +164,7 @@ def test_textures_are_opened_by_the_same_list(tmp_path):
 
 def test_the_list_holds_inside_alone(tmp_path):
     write_eps(tmp_path / "a.png")
-    with listed_formats(), pytest.raises(OSError, match="cannot identify"):
+    with limit_formats(), pytest.raises(OSError, match="cannot identify"):
         Image.open(tmp_path / "a.png")
     assert Image.open(tmp_path / "a.png").format == "EPS"
 
@@ -237,7 +237,7 @@ def test_maps_of_floats_are_refused(tmp_path):
     refused(r"mask\.tiff: expected whole numbers; found float32", lambda: read_map(path, (4, 4)))
 
 
-def transposed(pose: np.ndarray) -> np.ndarray:
+def transpose(pose: np.ndarray) -> np.ndarray:
     pose = pose.copy()
     pose[:3, 3] = [0, 0, 2]
     return pose.T
@@ -246,7 +246,7 @@ def transposed(pose: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("check", "matrix", "line"),
     [
-        (check_extrinsics, transposed(np.eye(4)), r"last row \[0, 0, 0, 1\]; found \[0.0, 0.0, 2.0, 1.0\]"),
+        (check_extrinsics, transpose(np.eye(4)), r"last row \[0, 0, 0, 1\]; found \[0.0, 0.0, 2.0, 1.0\]"),
         (check_extrinsics, 2 * np.eye(4), r"last row \[0, 0, 0, 1\]; found \[0.0, 0.0, 0.0, 2.0\]"),
         (check_extrinsics, np.diag([1.002, 1.002, 1.002, 1]), "a rotation in the first three columns"),
         (check_extrinsics, np.diag([1, 1, -1, 1]), "a rotation in the first three columns"),

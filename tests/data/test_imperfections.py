@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion, zoom
 
-from ghgs_lit.data.imperfections import draw_backgrounds, draw_color_gains, perturb_cameras, perturb_mask
+from ghgs_lit.data.imperfections import perturb_cameras, perturb_mask, sample_backgrounds, sample_color_gains
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.types import Cameras
@@ -30,7 +30,7 @@ def test_gains_stay_within_their_stops_and_change_nothing_on_average():
     the power 1/2.2), with a mean of 0."""
     largest = np.zeros(3)
     for seed in range(40):
-        gains = draw_color_gains(4, 0.5, 0.2, np.random.default_rng(seed))
+        gains = sample_color_gains(4, 0.5, 0.2, np.random.default_rng(seed))
         stops = 2.2 * np.log2(gains)
         np.testing.assert_allclose(stops.mean(0), 0, atol=1e-9)
         tint = stops - stops[:, [1]]
@@ -64,7 +64,7 @@ def test_masks_grow_shrink_and_fray_within_their_pixels():
 @pytest.mark.parametrize("size", [(60, 45), (31, 50)])
 def test_backgrounds_are_patches_that_scipy_enlarges(size):
     """Patterns equal those of SciPy's interpolation from the same random numbers, within float32 rounding."""
-    found = draw_backgrounds(2, *size, np.random.default_rng(4))
+    found = sample_backgrounds(2, *size, np.random.default_rng(4))
     rng = np.random.default_rng(4)
     expected = 0.5 + rng.uniform(-0.2, 0.2, (2, 3, 1, 1)) + 0.02 * rng.standard_normal((2, 3, *size))
     for cells, deviation in ((3, 0.35), (12, 0.15), (40, 0.06)):
@@ -112,7 +112,7 @@ def ring(shift=0.0, dtype=torch.float64) -> tuple[Cameras, torch.Tensor, torch.T
     return Cameras(cameras.intrinsics.to(dtype), extrinsics, 96, 72), masks, points + shift
 
 
-def moved_by(found: Cameras, cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
+def measure_motion(found: Cameras, cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
     """Root mean square motion [V] of points in pixels."""
     pixels = [
         [project(points, c.intrinsics[v].double(), c.extrinsics[v].double())[0] for v in range(4)]
@@ -128,7 +128,7 @@ def test_calibration_errors_move_the_subject_by_their_pixels(limit):
     errors = []
     for seed in range(25):
         found = perturb_cameras(cameras, masks, limit, np.random.default_rng(seed))
-        errors.append(moved_by(found, cameras, points))
+        errors.append(measure_motion(found, cameras, points))
         rotation = found.extrinsics[:, :3, :3]
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(4, 3, 3))
         assert (found.intrinsics[:, :2, 2] == cameras.intrinsics[:, :2, 2]).all()
@@ -165,7 +165,7 @@ def test_calibration_errors_do_not_depend_on_the_worlds_origin():
     for shift in (0.0, 1000.0):
         cameras, masks, points = ring(shift)
         found = perturb_cameras(cameras, masks, 2.0, np.random.default_rng(3))
-        results.append(moved_by(found, cameras, points))
+        results.append(measure_motion(found, cameras, points))
     torch.testing.assert_close(*results, rtol=1e-3, atol=0)
 
 
@@ -174,7 +174,7 @@ def test_a_photograph_without_the_subject_is_no_obstacle():
     cameras, masks, points = ring()
     masks[1] = False
     found = perturb_cameras(cameras, masks, 2.0, np.random.default_rng(0))
-    assert 0 < moved_by(found, cameras, points)[1] < 2.3
+    assert 0 < measure_motion(found, cameras, points)[1] < 2.3
     assert not perturb_mask(masks[1].numpy(), 2, 2, 0.2, 1.0, np.random.default_rng(0)).any()
 
 

@@ -220,7 +220,7 @@ def content(path: str, data: bytes):
     return lambda train: (train / path).write_bytes(data)
 
 
-def lack(path: str):
+def remove(path: str):
     return lambda train: (train / path).unlink()
 
 
@@ -228,10 +228,10 @@ IMAGE, MASK, MATRIX = "img/box_000/0.jpg", "mask/box_000/0.png", "parm/box_000/0
 ZEROS, SMALL = np.zeros((SIZE, SIZE), np.uint8), np.zeros((30, 20), np.uint8)
 OF_PHOTOGRAPH = "expected the size of its photograph, 56x56; found 30x20"
 DAMAGES = [
-    (lack(IMAGE), r"box_000/0\.jpg: expected an image; found no such file"),
+    (remove(IMAGE), r"box_000/0\.jpg: expected an image; found no such file"),
     (lambda train: truncate(train / IMAGE, 0.2), r"box_000/0\.jpg: expected a readable image; found"),
     (content(IMAGE, b"no image"), r"box_000/0\.jpg: expected a readable image; found"),
-    (lack(MASK), r"mask/box_000/0\.png: expected an image; found no such file"),
+    (remove(MASK), r"mask/box_000/0\.png: expected an image; found no such file"),
     (picture("mask", SMALL), rf"mask/box_000/0\.png: {OF_PHOTOGRAPH}"),
     (picture("depth", ZEROS), r"depth/box_000/0\.png: expected 16 bits of inverse depth; found 8"),
     (picture("depth", ZEROS.astype(np.uint16)), r"depth/.*: expected .* above 0 at the subject; found '0 ev"),
@@ -255,7 +255,7 @@ DAMAGES = [
         content(MATRIX, b"\x93NUMPY garbage"),
         r"0_intrinsic\.npy: expected an array 3x3; found a file that cannot be read",
     ),
-    (lack(MATRIX), r"0_intrinsic\.npy: expected an array 3x3; found no such file"),
+    (remove(MATRIX), r"0_intrinsic\.npy: expected an array 3x3; found no such file"),
 ]
 
 

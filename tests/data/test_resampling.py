@@ -10,10 +10,10 @@ from ghgs_lit.data.view import (
     View,
     area_image,
     area_mask,
-    centered_depth,
     encode_depth,
     release_image,
     release_mask,
+    resample_depth,
     resize_view,
 )
 from ghgs_lit.errors import InputError
@@ -93,11 +93,11 @@ def test_depth_is_that_of_the_new_centres(old, new):
     rows, columns = (np.mgrid[:new, :new] + 0.5) * old / new
     expected = 12000 + 20 * rows - 15 * columns
     inner = slice(1, -1)
-    found = centered_depth(inverse, new, new)[inner, inner]
+    found = resample_depth(inverse, new, new)[inner, inner]
     assert np.abs(found - expected[inner, inner]).max() <= 1.01
     step = np.where(np.arange(old) < old // 2 + 1, 16000, 8000) * np.ones((old, 1), int)
     step[:, -old // 4 :] = 0
-    assert set(np.unique(centered_depth(step.astype(np.uint16), new, new))) == {0, 8000, 16000}
+    assert set(np.unique(resample_depth(step.astype(np.uint16), new, new))) == {0, 8000, 16000}
 
 
 def test_a_resized_view_has_depth_in_its_mask_only():

@@ -47,7 +47,7 @@ def test_even_positions_are_the_protocols(count, positions):
 def test_uneven_views_stay_around_the_subject(count):
     """Positions are distinct, and each is at most one position from even spacing."""
     protocol = ViewProtocol(training_counts=(count,), training="uneven")
-    draws = [protocol.draw(FULL, count, 16, np.random.default_rng(seed)) for seed in range(80)]
+    draws = [protocol.sample(FULL, count, 16, np.random.default_rng(seed)) for seed in range(80)]
     gaps = {tuple(np.diff([*positions, positions[0]]) % 16) for positions in draws}
     assert all(len(set(positions)) == count for positions in draws)
     assert all(max(g) <= 16 // count + 3 for g in gaps)

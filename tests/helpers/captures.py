@@ -68,7 +68,7 @@ def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> 
         assert packed.pack(name) is not None
         for position in positions:
             found = packed.view(name, position, 0, False)
-            expected = resize_view(reader.checked_view(name, position, 0, False), size)
+            expected = resize_view(reader.read_checked_view(name, position, 0, False), size)
             for field in dataclasses.fields(View):
                 np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
 

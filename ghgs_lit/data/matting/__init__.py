@@ -120,7 +120,7 @@ WEIGHTS = Path(__file__).with_name("weights.safetensors")
 _AROUND = 16
 
 
-def refined_matte(
+def refine_matte(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], pixels: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
     """Refine a matte, and extract the subject on black.

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from ghgs_capture import Capture, crops
 from ghgs_lit.data import matting
-from ghgs_lit.data.matting import MattingNetwork, _insideness, _near, refined_matte
+from ghgs_lit.data.matting import MattingNetwork, _insideness, _near, refine_matte
 from ghgs_lit.geometry.masks import signed_distance
 from tests.helpers.figures import Figure
 
@@ -150,7 +150,7 @@ def test_the_photograph_mends_the_mask(scene, name):
     """The refined matte has less than 0.4 of the mask's error, and its colours less than 0.65."""
     photograph, premultiplied, alpha = scene
     mask = (255 * masks_of(alpha)[name]).astype(np.uint8)
-    subject, matte = refined_matte(photograph, mask, 4)
+    subject, matte = refine_matte(photograph, mask, 4)
     assert error(matte, alpha) < 0.4 * error(mask, alpha)
     given = photograph * (mask[..., None] / 255)
     assert error(subject, premultiplied) < 0.65 * error(given, premultiplied)
@@ -164,7 +164,7 @@ def test_far_from_the_outline_the_mask_decides(scene):
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     place = np.hypot(v - 105, u - 93)
     mask = (255 * ((alpha > 127) & (place >= 9))).astype(np.uint8)
-    _, matte = refined_matte(photograph, mask, 4)
+    _, matte = refine_matte(photograph, mask, 4)
     assert (matte[place < 4] == 0).all()
     far = np.abs(signed_distance(mask > 0)) + 0.5 > 4  # distance to the nearest pixel of the other side
     assert (matte[far] == mask[far]).all()
@@ -174,7 +174,7 @@ def test_far_from_the_outline_the_mask_decides(scene):
 def test_a_subject_that_the_border_cuts_stays_whole_there(scene):
     """The image border does not count as an outline."""
     photograph, _, alpha = (part[:150, :120] for part in scene)
-    _, matte = refined_matte(photograph, np.where(alpha > 127, 255, 0).astype(np.uint8), 4)
+    _, matte = refine_matte(photograph, np.where(alpha > 127, 255, 0).astype(np.uint8), 4)
     assert (matte[-1][alpha[-1] == 255] > 240).all()
     assert error(matte, alpha) < 0.02
 
@@ -184,7 +184,7 @@ def test_a_subject_that_the_border_cuts_stays_whole_there(scene):
 def test_masks_without_an_outline_stay(value, size):
     image = np.random.default_rng(0).integers(0, 255, (*size, 3)).astype(np.uint8)
     mask = np.full(size, value, np.uint8)
-    subject, matte = refined_matte(image, mask, 4)
+    subject, matte = refine_matte(image, mask, 4)
     assert (matte == mask).all()
     assert np.abs(subject.astype(int) - image * (value // 255)).max() <= 3
 
@@ -199,7 +199,7 @@ def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, heig
         calls.append((image.shape[:2], matte.shape, pixels))
         return image, matte
 
-    monkeypatch.setattr(matting, "refined_matte", record)
+    monkeypatch.setattr(matting, "refine_matte", record)
     figure = Figure(height=height, width=height * 3 // 4)
     taken = Capture.read(tmp_path, figure.write(tmp_path))
     cut = [int(1 / crops.SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
@@ -232,7 +232,7 @@ def test_a_matte_that_loses_the_subject_is_refused(monkeypatch, tmp_path):
     """The mask stays unchanged, and a warning names the image."""
     figure = Figure()
     taken = Capture.read(tmp_path, figure.write(tmp_path))
-    monkeypatch.setattr(matting, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
+    monkeypatch.setattr(matting, "refine_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
     with pytest.warns(UserWarning, match="refine_masks: expected colours of cam") as warned:
         found = taken.batch((56, 42), 4)
     assert len(warned) == len(taken.photographs)
@@ -246,5 +246,5 @@ def test_colors_that_say_nothing_leave_the_subject():
     """A subject that looks like its background keeps nearly all of its mask."""
     mask = np.zeros((96, 64), np.uint8)
     mask[16:80, 28:36] = 255
-    _, matte = refined_matte(np.full((96, 64, 3), 120, np.uint8), mask, 4)
+    _, matte = refine_matte(np.full((96, 64, 3), 120, np.uint8), mask, 4)
     assert error(matte, mask) < 0.2

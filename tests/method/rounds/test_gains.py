@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.data.imperfections import draw_color_gains
+from ghgs_lit.data.imperfections import sample_color_gains
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.rounds.gains import divided, equalized, log_gains, log_gammas
 from tests.helpers.models import make_model, predict
@@ -38,7 +38,7 @@ def seen_with(batch, gains):
 
 def drawn(batch, seed=0, stops=0.5):
     rng = np.random.default_rng(seed)
-    return np.stack([draw_color_gains(batch.masks.shape[1], stops, stops / 2, rng) for _ in batch.masks])
+    return np.stack([sample_color_gains(batch.masks.shape[1], stops, stops / 2, rng) for _ in batch.masks])
 
 
 @pytest.mark.parametrize("seed", range(3))
