@@ -239,7 +239,7 @@ def train(row: str, seed: int, steps: int, people: list[Person]) -> Model:
         truth = scene.person.truth.pixels[0].flatten(1, 2)[gaussians.image, gaussians.pixel]
         targets = scene.batch.targets
         view = rng.integers(targets.masks.shape[1])
-        cameras = targets.cameras[:, [view]].resized(targets.cameras.height // 2, targets.cameras.width // 2)
+        cameras = targets.cameras[:, [view]].resize(targets.cameras.height // 2, targets.cameras.width // 2)
         render = Renderer()(gaussians, cameras).image[0, 0]
         loss = 10 * (gaussians.means - truth).norm(dim=1).mean()
         loss = loss + 5 * (render - F.avg_pool2d(targets.images[0, view], 2)).abs().mean()

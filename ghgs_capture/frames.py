@@ -23,7 +23,7 @@ from ghgs_capture.photographs import (
 )
 from ghgs_capture.videos import SUFFIXES, Reader, Video, read_video
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import composed, read_rows
+from ghgs_lit.parsing import normalize_name, read_rows
 from ghgs_lit.runtime.cores import allowed_cores
 
 # Coding changes black and white by less than this.
@@ -182,7 +182,7 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
             raise ValueError("no time")
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
-    cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
+    cameras = table.camera.map(lambda name: names.get(normalize_name(name), normalize_name(name)))
     times = {name: timed.sort_values("seconds") for name, timed in table.groupby(cameras)}
     require(times.keys() == videos.keys(), str(path), f"the times of {', '.join(videos)}", ", ".join(times))
     first, *others = videos
@@ -219,7 +219,7 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict
     Raises:
         InputError: ``masks`` has none of this video, or they are not numbered as its frames.
     """
-    name = composed(video.path.stem)
+    name = normalize_name(video.path.stem)
     place = folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
     names = (marked,) if os.path.realpath(place) == os.path.realpath(folder) else (name, marked)

@@ -12,7 +12,7 @@ import numpy as np
 from ghgs_capture.calibration import StoredCamera, same_ratio
 from ghgs_lit.data.images import orientation_of, read_image, rgb_of
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import composed, find_path
+from ghgs_lit.parsing import find_path, normalize_name
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
 #: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.
@@ -98,7 +98,7 @@ def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
     Returns:
         The same as text, in Unicode's composed form.
     """
-    return {composed(str(key)): composed(str(name)) for key, name in (names or {}).items()}
+    return {normalize_name(str(key)): normalize_name(str(name)) for key, name in (names or {}).items()}
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
@@ -120,7 +120,7 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
         if not is_image or _MASK.search(path.stem):
             continue
         require(not path.is_dir(), str(path), "a photograph", "a folder")
-        name = composed(path.stem)
+        name = normalize_name(path.stem)
         require(name not in paths, str(path), "one file for each photograph", str(paths.get(name)))
         paths[name] = path
     return paths
@@ -132,7 +132,7 @@ def parts_of_name(name: str) -> tuple[str, ...]:
     Args:
         name: of a photograph or a mask, without suffix.
     """
-    parts = re.findall(r"\d+|[^\W\d_]+", composed(name).casefold())
+    parts = re.findall(r"\d+|[^\W\d_]+", normalize_name(name).casefold())
     return tuple(part for part in parts if part not in _KINDS.split())
 
 
@@ -191,7 +191,7 @@ def require_all_read(
             such as ``right.heic`` or ``right.jpg.part``.
     """
     for path in sorted(folder.iterdir()):
-        name = composed(path.name)
+        name = normalize_name(path.name)
         kind = path.suffix.lower().removeprefix(".")
         begins = {name[:end] for end, letter in enumerate(f"{name}.") if letter == "."}
         is_other = path.name.startswith(".") or path.is_dir() or _MASK.search(path.stem)
@@ -235,7 +235,7 @@ def find_instants(
             return {name or folder.resolve().name: paths for name, paths in instants.items()}
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     places = {
-        composed(path.name): path
+        normalize_name(path.name): path
         for path in sorted(folder.iterdir(), key=lambda path: counted(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }

@@ -47,7 +47,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
         _sync(path.parent)
     except Exception as error:
         # PyTorch and safetensors raise other errors for a full disk.
-        cause = error if isinstance(error, OSError) else _refusal(temporary)
+        cause = error if isinstance(error, OSError) else _find_write_error(temporary)
         if cause is None or cause.errno is None:
             raise
         raise OSError(cause.errno, cause.strerror, str(path)) from error
@@ -112,7 +112,7 @@ def require_writable(folder: Path, key: str, what: str) -> Path:
 
 
 @contextlib.contextmanager
-def naming(folder: Path) -> Iterator[None]:
+def name_folder_in_errors(folder: Path) -> Iterator[None]:
     """Add a folder to each OSError inside the context that has no file name, such as for a full disk.
 
     Args:
@@ -129,7 +129,7 @@ def naming(folder: Path) -> Iterator[None]:
         probe = folder / f".{os.getpid()}.tmp"
         try:
             # NumPy's error for a full disk has no errno.
-            cause = error if error.errno is not None else _refusal(probe)
+            cause = error if error.errno is not None else _find_write_error(probe)
         finally:
             probe.unlink(missing_ok=True)
         if cause is None:
@@ -137,7 +137,7 @@ def naming(folder: Path) -> Iterator[None]:
         raise OSError(cause.errno, cause.strerror, str(folder)) from error
 
 
-def _refusal(path: Path) -> OSError | None:
+def _find_write_error(path: Path) -> OSError | None:
     """The error of the system when more is written to the file ``path``; None: writing succeeds."""
     try:
         with path.open("ab") as file:
@@ -147,7 +147,7 @@ def _refusal(path: Path) -> OSError | None:
     return None
 
 
-def resolved(path: str | Path) -> Path:
+def resolve_path(path: str | Path) -> Path:
     """The absolute path without links or ``~``.
 
     Raises:
@@ -228,10 +228,10 @@ def _sync(place: Path) -> None:
         os.close(handle)
 
 
-def _place_of_lock(path: str | Path) -> Path:
+def _resolve_lock_path(path: str | Path) -> Path:
     """The path, with links in its folders resolved, but not a link to the file."""
     path = Path(path)
-    return resolved(path.parent) / path.name
+    return resolve_path(path.parent) / path.name
 
 
 def _open_lock(path: Path, flags: int) -> int:
@@ -280,11 +280,11 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
         InputError: the file system has no locks, or the file is a link or has other content than an
             owner, which is kept.
     """
-    path = _place_of_lock(path)
+    path = _resolve_lock_path(path)
     if path in _HELD:
         yield False
         return
-    handle, locked = _locked_file(path, wait)
+    handle, locked = _open_locked(path, wait)
     try:
         if locked:
             _HELD.add(path)
@@ -296,7 +296,7 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
         _HELD.discard(path)
 
 
-def _locked_file(path: Path, wait: bool) -> tuple[int, bool]:
+def _open_locked(path: Path, wait: bool) -> tuple[int, bool]:
     """File descriptor of the lock file, and whether the lock was acquired."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -321,7 +321,7 @@ def is_locked(path: str | Path) -> bool:
     Raises:
         InputError: as for :func:`lock`.
     """
-    path = _place_of_lock(path)
+    path = _resolve_lock_path(path)
     if path in _HELD:
         return True
     if not path.exists():

@@ -60,14 +60,14 @@ def require_folder(folder: Path, expected: str = "the folder of the data set") -
         raise InputError(f"{folder}: expected {expected}; found {found}")
 
 
-def composed(name: str) -> str:
+def normalize_name(name: str) -> str:
     """Normalise a name to composed characters (NFC); macOS stores an umlaut as two characters."""
     return unicodedata.normalize("NFC", name)
 
 
-def parts_of(name: str) -> list[str]:
+def split_path(name: str) -> list[str]:
     """Split a path with slashes or backslashes into NFC-normalised folders and file."""
-    return composed(name).replace("\\", "/").split("/")
+    return normalize_name(name).replace("\\", "/").split("/")
 
 
 def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path | None:
@@ -90,34 +90,34 @@ def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path 
                 return exact
         except (OSError, ValueError):  # too long, a null character, links in a loop
             continue
-    *folders, last = parts_of(name)
+    *folders, last = split_path(name)
     for part in folders:
-        below = folder / part if part in ("", ".", "..") else _alike(folder, part)
+        below = folder / part if part in ("", ".", "..") else _find_entry(folder, part)
         if below is None:
             return None
         folder = below
-    return next((path for suffix in suffixes if (path := _alike(folder, f"{last}{suffix}"))), None)
+    return next((path for suffix in suffixes if (path := _find_entry(folder, f"{last}{suffix}"))), None)
 
 
-def _alike(folder: Path, name: str) -> Path | None:
+def _find_entry(folder: Path, name: str) -> Path | None:
     """The only entry of a folder that is spelled as ``name``, or else differs only by case."""
     if not folder.is_dir():
         return None
-    paths = _listed(folder, folder.stat().st_mtime_ns).get(name.casefold(), [])
+    paths = _list_folder(folder, folder.stat().st_mtime_ns).get(name.casefold(), [])
     stem = Path(name).stem
-    same = [path for path in paths if composed(path.stem) == stem] or paths
+    same = [path for path in paths if normalize_name(path.stem) == stem] or paths
     return same[0] if len(same) == 1 else None
 
 
 @functools.lru_cache(maxsize=64)
-def _listed(folder: Path, changed: int) -> dict[str, list[Path]]:
+def _list_folder(folder: Path, changed: int) -> dict[str, list[Path]]:
     """Entries of a folder by their composed names in lower case.
 
     ``changed``, the folder's time of modification in nanoseconds, invalidates the cache.
     """
     paths: dict[str, list[Path]] = {}
     for path in sorted(folder.iterdir()):
-        paths.setdefault(composed(path.name).casefold(), []).append(path)
+        paths.setdefault(normalize_name(path.name).casefold(), []).append(path)
     return paths
 
 
@@ -159,7 +159,7 @@ def read_yaml(path: Path) -> Any:
     Raises:
         InputError: as for :func:`read_json`, or an alias, by which content can grow without limit.
     """
-    return read_parsed(path, "YAML", _plain_yaml)
+    return read_parsed(path, "YAML", _parse_plain_yaml)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -209,7 +209,7 @@ def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray"
         raise InputError(f"{path}: expected {expected}; found a file that cannot be read: {error}") from error
 
 
-def _plain_yaml(text: str) -> Any:
+def _parse_plain_yaml(text: str) -> Any:
     check_yaml(text, aliases=False)
     content = yaml.safe_load(text)
     _require_plain(content)
@@ -268,7 +268,7 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
     """
     try:
         value = parse(read_text(path, expected))
-        if _levels(value) > DEEPEST:
+        if _count_levels(value) > DEEPEST:
             raise ValueError(f"more than {DEEPEST} levels")
     except InputError:
         raise
@@ -282,7 +282,7 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
     return value
 
 
-def _levels(value: Any) -> int:
+def _count_levels(value: Any) -> int:
     """Number of levels of nested mappings and lists.
 
     Raises:
@@ -291,7 +291,7 @@ def _levels(value: Any) -> int:
     if isinstance(value, int) and value.bit_length() > 1023:
         raise ValueError(f"a number of {value.bit_length()} bits")
     children = value.values() if isinstance(value, dict) else value
-    return 1 + max(map(_levels, children), default=0) if isinstance(value, dict | list) else 0
+    return 1 + max(map(_count_levels, children), default=0) if isinstance(value, dict | list) else 0
 
 
 def _require_plain(value: Any) -> None:

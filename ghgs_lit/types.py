@@ -110,14 +110,14 @@ class Cameras(TensorStruct):
     def __getitem__(self, index) -> "Cameras":
         return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])
 
-    def resized(self, height: int, width: int) -> "Cameras":
+    def resize(self, height: int, width: int) -> "Cameras":
         """The same cameras for an image resized to ``height`` x ``width`` pixels."""
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, :] *= width / self.width
         intrinsics[..., 1, :] *= height / self.height
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
-    def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
+    def crop(self, top: int, left: int, height: int, width: int) -> "Cameras":
         """The same cameras for a crop of the image.
 
         Args:
@@ -193,7 +193,7 @@ class Batch(TensorStruct):
             kept.append(tuple(subject[view] for view in views))
         return dataclasses.replace(self, **parts, views=tuple(kept))
 
-    def recolored(self, **changes: Tensor) -> "Batch":
+    def recolor(self, **changes: Tensor) -> "Batch":
         """The batch with other colours and the same masks, whose extents stay cached."""
         changed = dataclasses.replace(self, **changes)
         names = ("extents", "pixels", "_pixels")

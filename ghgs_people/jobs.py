@@ -35,7 +35,7 @@ from ghgs_lit.data.layout import Completeness, position_name
 from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import lock, naming, write_text_atomically
+from ghgs_lit.files import lock, name_folder_in_errors, write_text_atomically
 from ghgs_lit.parsing import read_json
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_people import figures
@@ -248,7 +248,7 @@ def render_people(
     if not any(notes.missing(phase, listed) for phase, listed in names.items()):
         return 0
     workspaces = notes.folder / "tmp"
-    with lock(notes.folder / "lock", wait=True) as held, naming(notes.root):
+    with lock(notes.folder / "lock", wait=True) as held, name_folder_in_errors(notes.root):
         require(held, str(root), "one rendering at a time in a process", "another")
         check_settings(notes, made_with)  # another process may have written others meanwhile
         shutil.rmtree(workspaces, ignore_errors=True)  # of killed runs

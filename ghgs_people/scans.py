@@ -16,7 +16,7 @@ from PIL import Image
 from ghgs_lit.data.decoding import check_extent, read_vertices
 from ghgs_lit.data.images import limit_formats, read_image
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import find_path, parts_of, require_folder
+from ghgs_lit.parsing import find_path, require_folder, split_path
 from ghgs_people.figures.mesh import Person, TexturedMesh
 
 log = logging.getLogger(__name__)
@@ -117,7 +117,7 @@ class _Beside(trimesh.resolvers.FilePathResolver):
         folder = Path(self.parent)
         # Escapes of a URI, folders of another machine, and options of map_Kd,
         # which stand before the name.
-        for spelling in (name, unquote(name), parts_of(name)[-1], *name.split()[-1:]):
+        for spelling in (name, unquote(name), split_path(name)[-1], *name.split()[-1:]):
             path = find_path(folder, spelling) if spelling else None
             if path is not None and path.is_file():
                 return path.read_bytes()

@@ -20,7 +20,7 @@ from ghgs_lit.files import (
     is_locked,
     lock,
     lock_owner,
-    naming,
+    name_folder_in_errors,
     require_free,
     require_no_links,
     write_atomically,
@@ -126,7 +126,7 @@ def write_limited(kind, folder, answers):
     try:
         if kind in write:
             write_atomically(folder / "last.ckpt", write[kind])
-        with naming(folder):
+        with name_folder_in_errors(folder):
             np.save(folder / "a.npy", numbers)
     except BaseException as error:
         answers.put((type(error), str(error)))
@@ -154,7 +154,7 @@ def test_a_full_disk_is_reported_with_the_file_or_folder(tmp_path, kind, named, 
 
 
 def test_errors_that_name_a_file_keep_it(tmp_path):
-    with pytest.raises(FileNotFoundError) as caught, naming(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught, name_folder_in_errors(tmp_path):
         (tmp_path / "none").read_text()
     assert caught.value.filename == str(tmp_path / "none")
 

@@ -49,7 +49,7 @@ def test_padding_is_what_a_black_border_does_by_hand():
     batch = make_batch(1, 3, 50, 64)
     border = nn.functional.pad(batch.images, (3, 3, 3, 3))
     masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))
-    by_hand = Batch(border, masks, batch.cameras.cropped(-3, -3, 56, 70))
+    by_hand = Batch(border, masks, batch.cameras.crop(-3, -3, 56, 70))
     model = make_model("model=paper", *PADS)
     found = predict(model, batch)
     # The box is carved from the unpadded images: with a border, nothing would lie outside them.

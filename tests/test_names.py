@@ -3,7 +3,7 @@ share."""
 
 import pytest
 
-from ghgs_lit.parsing import find_path, parts_of
+from ghgs_lit.parsing import find_path, split_path
 
 #: Stored file, name given by a file or user, accepted suffixes.
 SPELLINGS = [
@@ -51,4 +51,4 @@ def test_a_file_that_arrives_later_is_found(tmp_path):
 
 
 def test_parts_of_a_path():
-    assert parts_of("images\\Ka\u0308the/0.png") == ["images", "K\u00e4the", "0.png"]
+    assert split_path("images\\Ka\u0308the/0.png") == ["images", "K\u00e4the", "0.png"]

@@ -66,7 +66,7 @@ def paint_features(count, size):
     features = F.avg_pool2d(maps.flatten(0, 1).movedim(-1, 1), CELL)
     whole = F.avg_pool2d(masks.flatten(0, 1).float(), CELL) == 1
     mean = F.avg_pool2d(depths.flatten(0, 1), CELL)
-    return F.normalize(features, dim=1).unflatten(0, (1, count)), cameras.resized(cells, cells), whole, mean
+    return F.normalize(features, dim=1).unflatten(0, (1, count)), cameras.resize(cells, cells), whole, mean
 
 
 def limits(depth, whole):

@@ -103,7 +103,7 @@ class StereoHead(nn.Module):
         maps = self.features(images.flatten(0, 1).nan_to_num().to(self.features[0].weight.dtype))
         features, memory, context = maps.chunk(3, 1)
         features = at_least_float32(features).unflatten(0, batch.masks.shape[:2])
-        cameras = batch.cameras.cropped(0, 0, *images.shape[-2:]).resized(*features.shape[-2:])
+        cameras = batch.cameras.crop(0, 0, *images.shape[-2:]).resize(*features.shape[-2:])
         inside = F.max_pool2d(images[:, :, 3], CELL) > 0
         cells = true_places(inside, _most_cells(batch, inside.numel()), repeats=True)
         matches = correlations(features, cameras, cells, near, far, self.options.consistency_depths)

@@ -138,7 +138,7 @@ class Instants:
         shifts = torch.from_numpy(path).to(seen.extrinsics)
         seen.extrinsics[:, :3, 3] -= (seen.extrinsics[:, :3, :3] @ shifts[..., None])[..., 0]
         larger = max(_VIDEO_SIDE / max(seen.height, seen.width), 1.0)
-        seen = seen.resized(round(larger * seen.height), round(larger * seen.width))
+        seen = seen.resize(round(larger * seen.height), round(larger * seen.width))
 
         def picture(frame: int) -> np.ndarray:
             gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)

@@ -15,7 +15,7 @@ from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.photographs import PICTURES, SUFFIXES
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import composed, parts_of
+from ghgs_lit.parsing import normalize_name, split_path
 
 #: What files call the same thing, as :func:`plain` spells it.
 NAMES = {
@@ -313,7 +313,7 @@ class CameraFile:
         for part in (-1, -2, 0):
             named: dict[str, StoredCamera] = {}
             for camera in cameras:
-                name = _split_name(camera.name)[part:][0] if part else composed(camera.name)
+                name = _split_name(camera.name)[part:][0] if part else normalize_name(camera.name)
                 if name not in named:
                     named[name] = camera
                 elif named[name].has_numbers_of(camera):
@@ -326,7 +326,7 @@ class CameraFile:
 
 
 def _split_name(name: str) -> list[str]:
-    *folders, last = parts_of(name)
+    *folders, last = split_path(name)
     path = Path(last)
     suffix = path.suffix.lower()
     is_picture = suffix in SUFFIXES or suffix[1:] in PICTURES.split()

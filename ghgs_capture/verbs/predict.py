@@ -23,7 +23,7 @@ from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.execution import Predictor
-from ghgs_lit.files import resolved
+from ghgs_lit.files import resolve_path
 from ghgs_lit.parsing import read_json
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.weights.checkpoint import read_config
@@ -38,7 +38,7 @@ LOW_PSNR = 25.0
 @torch.no_grad()
 def run(verb: "Predict") -> None:
     """Predict the user's photographs, or a subject of a data set, and write the files."""
-    directory = output_dir() if verb.out is None else resolved(verb.out)
+    directory = output_dir() if verb.out is None else resolve_path(verb.out)
     is_capture = verb.images is not None or verb.cameras is not None
     verb = verb if is_capture else inputs.with_trained_data(verb)
     verb = verb.replace(**inputs.model_of(verb.checkpoint, verb))

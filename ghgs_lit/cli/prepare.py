@@ -10,7 +10,7 @@ from ghgs_lit.data.check import inspect
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
-from ghgs_lit.files import resolved
+from ghgs_lit.files import resolve_path
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Prepare
@@ -25,7 +25,7 @@ def run(verb: "Prepare") -> None:
         InputError: The configuration or the data is wrong.
     """
     data = verb.data.build(views=verb.views, targets=verb.targets, seed=verb.seed)
-    root = resolved(data.dataset.root or ".")
+    root = resolve_path(data.dataset.root or ".")
     if verb.task == "render":
         render(data)
         announce(root)

@@ -10,12 +10,12 @@ from ghgs_lit.cli.verb import Verb
 from ghgs_lit.config.compose import HEADER, saved_text
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import require
-from ghgs_lit.files import require_free, resolved, write_text_atomically
+from ghgs_lit.files import require_free, resolve_path, write_text_atomically
 
 
 def output_dir() -> Path:
     """Absolute path of the run's directory, which Hydra creates."""
-    return resolved(HydraConfig.get().runtime.output_dir)
+    return resolve_path(HydraConfig.get().runtime.output_dir)
 
 
 def write_config(run: Run, directory: Path) -> None:
@@ -47,11 +47,11 @@ def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path
     """
     named = {key: getattr(options, key) for key in keys}
     paths = {key: Path(path).expanduser() for key, path in named.items() if path is not None}
-    taken = {resolved(path) for path in read}
+    taken = {resolve_path(path) for path in read}
     for key, path in paths.items():
-        require(resolved(path) not in taken, key, "a file of its own", str(path))
+        require(resolve_path(path) not in taken, key, "a file of its own", str(path))
         require_free(path, key, options.overwrite)
-        taken.add(resolved(path))
+        taken.add(resolve_path(path))
     return paths
 
 

@@ -8,7 +8,7 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
-from ghgs_lit.files import resolved, write_text_atomically
+from ghgs_lit.files import resolve_path, write_text_atomically
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Table
@@ -59,7 +59,7 @@ def run(verb: "Table") -> None:
     write_config(verb, directory)
     options = _options(verb)
     # Resolved, so that a run found by two paths counts once.
-    folders = [resolved(path) for path in _list_values(verb, "runs") or ()]
+    folders = [resolve_path(path) for path in _list_values(verb, "runs") or ()]
     others = [t.read_others(Path(p).expanduser()) for p in _list_values(verb, "others") or ()]
     sweep = t.read_sweep(folders, _list_values(verb, "by") or ())
     tables = t.build_tables(sweep, others, options)

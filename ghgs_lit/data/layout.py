@@ -38,7 +38,7 @@ from ghgs_lit.data.decoding import (
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import composed, find_path, read_json, require_folder
+from ghgs_lit.parsing import find_path, normalize_name, read_json, require_folder
 
 #: Folder of the renderer's records.
 FOLDER = "rendering"
@@ -157,7 +157,8 @@ class Layout(Reader):
                     f"{self.root}: expected each subject in train or in val; found {name!r} in both"
                 )
         planned = self._complete.plan.get(phase, [])
-        wanted = (sorted({*stored[phase], *planned}) if names is None else list(map(composed, names)))[:limit]
+        listed = {*stored[phase], *planned}
+        wanted = (sorted(listed) if names is None else list(map(normalize_name, names)))[:limit]
         homes = {}
         for name in wanted:
             homes[name] = next((p for p in phases if name in stored[p]), phase)
@@ -277,6 +278,6 @@ def position_name(name: str, position: int) -> str:
 def _positions(images: Path) -> dict[str, list[int]]:
     positions: dict[str, list[int]] = {}
     for entry in images.iterdir() if images.is_dir() else ():
-        if match := _POSITION.fullmatch(composed(entry.name)):
+        if match := _POSITION.fullmatch(normalize_name(entry.name)):
             positions.setdefault(match[1], []).append(int(match[2]))
     return positions

@@ -42,7 +42,7 @@ class Padding:
             masks=self.pad(batch.masks, False),
             depths=None if batch.depths is None else self.pad(batch.depths),
             alpha=None if batch.alpha is None else self.pad(batch.alpha),
-            cameras=batch.cameras.cropped(self.top, self.left, self.height, self.width),
+            cameras=batch.cameras.crop(self.top, self.left, self.height, self.width),
         )
 
     def cut_prediction(self, prediction: Prediction) -> Prediction:

@@ -31,7 +31,7 @@ from ghgs_lit.files import (
     lock,
     lock_owner,
     require_no_links,
-    resolved,
+    resolve_path,
     write_text_atomically,
 )
 from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
@@ -115,7 +115,7 @@ class RunDirectory:
     """
 
     def __init__(self, path: Path, config_hash: str | None = None) -> None:
-        self.path = resolved(path)
+        self.path = resolve_path(path)
         self.config_hash = config_hash
         self._lock = self.path / ".lock"
         self._is_mine = False
@@ -273,7 +273,7 @@ class RunDirectory:
 
     def _has(self, path: str | None) -> bool:
         """Whether ``path`` is a file of this run."""
-        return path not in (None, AUTO) and resolved(path).is_relative_to(self.path)
+        return path not in (None, AUTO) and resolve_path(path).is_relative_to(self.path)
 
     def _rejection(self, run: Run, there: str, owned: bool) -> str:
         ways = "hydra.run.dir or hydra.sweep.subdir name another"
@@ -381,7 +381,7 @@ class RunDirectory:
             A dict for numbers such as steps and seconds, which are logged at the end.
         """
         if self._has(resumed):
-            resumed = str(resolved(resumed).relative_to(self.path))
+            resumed = str(resolve_path(resumed).relative_to(self.path))
         process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch_id()}
         self._log("started", **process, resumed=resumed)
         stats: dict[str, Any] = {}

@@ -23,7 +23,7 @@ from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.registry import verb_class
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import require_writable, resolved, write_text_atomically
+from ghgs_lit.files import require_writable, resolve_path, write_text_atomically
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.plan import PlannedRun, Rehearse, print_plan, print_states, shared_overrides
@@ -73,7 +73,7 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
         Interrupted: Ctrl-C or SIGTERM; no further run is started.
     """
     config = sweeper.config
-    directory = resolved(str(config.hydra.sweep.dir))
+    directory = resolve_path(str(config.hydra.sweep.dir))
     started: list[PlannedRun] = []
     try:
         with interruptible():

@@ -8,7 +8,7 @@ from torch import nn
 
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import resolved
+from ghgs_lit.files import resolve_path
 from ghgs_lit.method.stages import STAGES
 from ghgs_lit.runs.results import differences
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
@@ -26,7 +26,7 @@ def check_start(run: "Train", directory: Path) -> None:
         InputError: both are given."""
     if run.resume is None or run.init_from is None:
         return
-    own = resolved(run.resume).is_relative_to(directory.resolve())
+    own = resolve_path(run.resume).is_relative_to(directory.resolve())
     require(own, "init_from", "null where resume is given", run.init_from)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ghgs_lit.config.keys import flatten, require_plain
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import resolved, write_atomically
+from ghgs_lit.files import resolve_path, write_atomically
 from ghgs_lit.geometry.precision import fast_precision
 from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.reading import open_file, require_dense
@@ -201,7 +201,7 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
         InputError: a weight overflows the dtype, both paths are the same file, or the checkpoint
             holds the encoder alone.
     """
-    if resolved(checkpoint) == resolved(path):
+    if resolve_path(checkpoint) == resolve_path(path):
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
     content = read_checkpoint(checkpoint, whole=True)
     require("depth_head" in content["config"], str(checkpoint), "a whole model", "the encoder alone")

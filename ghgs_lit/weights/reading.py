@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.files import resolved
+from ghgs_lit.files import resolve_path
 
 if TYPE_CHECKING:  # a missing file is reported without importing PyTorch
     from torch import Tensor
@@ -82,7 +82,7 @@ def require_weights(path: str | Path) -> bytes:
     if path.is_dir():
         raise _unfit(path, "a directory")
     if not path.is_file():
-        resolved(path)  # rejects cyclic links
+        resolve_path(path)  # rejects cyclic links
         raise FileNotFoundError(f"{path}: expected a file of weights; found none")
     with path.open("rb") as file:
         start = file.read(64)

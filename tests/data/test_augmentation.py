@@ -101,7 +101,7 @@ def test_sizes_are_drawn_for_a_step_and_cameras_follow(boxes):
         scales.append(ratios[0])
         assert (batch.cameras.height, batch.cameras.width) == size
         whole = data.photographs("train").batch(data.training_sampler().batch(step))
-        expected = whole.cameras.resized(*size).intrinsics
+        expected = whole.cameras.resize(*size).intrinsics
         torch.testing.assert_close(batch.cameras.intrinsics, expected)
         processes = [data.training_batches(1, rank, 2)[step] for rank in (0, 1)]
         assert len({one.images.shape[-3:] for one in processes}) == 1

@@ -123,7 +123,7 @@ def test_resized_views_keep_their_geometry(root, size):
     original = photographs(root).view("box", 0, 0)
     np.testing.assert_allclose(view.intrinsics, original.intrinsics * scale[:, None], rtol=1e-6)
     # Equal to the rig's camera resized to this size.
-    camera = RIG.cameras(np.zeros(1), SIZE, SIZE).resized(*size)
+    camera = RIG.cameras(np.zeros(1), SIZE, SIZE).resize(*size)
     np.testing.assert_allclose(view.intrinsics, camera.intrinsics[0], rtol=1e-5)
 
 

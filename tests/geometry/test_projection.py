@@ -53,7 +53,7 @@ def test_resized_cameras_see_points_at_the_same_share_of_the_photograph():
         return project(points.expand(2, 7, 3), lens, pose)[0]
 
     expected = seen(cameras) * torch.tensor([32 / 64, 120 / 40])
-    torch.testing.assert_close(seen(cameras.resized(120, 32)), expected)
+    torch.testing.assert_close(seen(cameras.resize(120, 32)), expected)
 
 
 def test_sampling_is_bilinear_and_0_outside():

@@ -13,7 +13,7 @@ from tests.method.heads.test_depth import PATCH, assert_points, make_tokens, squ
 
 def release_token_points(inverse, cameras, dtype):
     """Token points of a padded 518 x 518 inverse depth whose cameras are those of the inner 512 x 512."""
-    padded = cameras.cropped(-3, -3, 518, 518)
+    padded = cameras.crop(-3, -3, 518, 518)
     depth = inverse_linear(inverse)
     _, views = depth.shape[:2]
     maps = DepthMaps(depth, torch.ones_like(depth, dtype=torch.bool), torch.ones_like(depth))

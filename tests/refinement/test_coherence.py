@@ -32,7 +32,7 @@ def _parts():
 def figure(batch=1, views=4, size=126):
     """Mattes and depths of the figure, in the subject's frame."""
     cameras = ring(batch, views, size, size)
-    finer = [ellipsoid(cameras.resized(4 * size, 4 * size), *part)[0] for part in _parts()]
+    finer = [ellipsoid(cameras.resize(4 * size, 4 * size), *part)[0] for part in _parts()]
     alpha = torch.nn.functional.avg_pool2d(torch.stack(finer).any(0).float(), 4)
     found = [ellipsoid(cameras, *part) for part in _parts()]
     masks = torch.stack([mask for mask, _ in found]).any(0)
@@ -300,7 +300,7 @@ def instants(count=3, views=4, size=98):
         moved = torch.eye(4)
         moved[:3, 3] = torch.tensor([0.15 * number, 0.0, -0.1 * number])
         place = dataclasses.replace(cameras, extrinsics=cameras.extrinsics @ moved)
-        parts = [ellipsoid(place.resized(4 * size, 4 * size), *part)[0] for part in _parts()]
+        parts = [ellipsoid(place.resize(4 * size, 4 * size), *part)[0] for part in _parts()]
         found.append(torch.nn.functional.avg_pool2d(torch.stack(parts).any(0).float(), 4))
     alpha = torch.cat(found)
     lens, pose = (

@@ -134,7 +134,7 @@ def silhouettes(
     # Whole cells: the last row and column may extend beyond the image.
     matrices = map(at_least_float32, (cameras.intrinsics, cameras.extrinsics))
     full = Cameras(*matrices, height * stride, width * stride)
-    return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)), cut)
+    return Silhouettes(masks, full.resize(height, width), stride, ceil(dilation * max(height, width)), cut)
 
 
 def dilate(

@@ -270,7 +270,7 @@ def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
         images=images.clamp(0, 1),
         masks=shares > least_matte if has_matte else shares >= _COVERED,
         alpha=shares if has_matte else None,
-        cameras=batch.cameras.resized(*size),
+        cameras=batch.cameras.resize(*size),
         depths=None,
         targets=None,
     )

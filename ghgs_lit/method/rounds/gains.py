@@ -64,7 +64,7 @@ def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
         logs: natural logarithms of the gains of each camera and channel.
     """
     images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
-    return batch.recolored(images=images, log_gains=logs)
+    return batch.recolor(images=images, log_gains=logs)
 
 
 @torch.no_grad()

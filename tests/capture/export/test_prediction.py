@@ -196,7 +196,7 @@ def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size
     alphas = {}
     for smooth in (False, True):
         write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(smooth=smooth))
-        large = render(read_ply(tmp_path / "gaussians.ply"), cameras.resized(240, 240)).alpha[0, :, 0]
+        large = render(read_ply(tmp_path / "gaussians.ply"), cameras.resize(240, 240)).alpha[0, :, 0]
         alphas[smooth] = torch.nn.functional.avg_pool2d(large, 4)
     wanted = render(gaussians, cameras).alpha[0, :, 0]
     errors = {smooth: float((alpha - wanted).abs()[wanted > 0.5].mean()) for smooth, alpha in alphas.items()}
