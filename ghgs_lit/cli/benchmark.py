@@ -1,4 +1,4 @@
-"""``ghgs benchmark``: measure run time and error of every preset."""
+"""``ghgs benchmark``: run time against error of the presets of ``skip``."""
 
 import itertools
 import math
@@ -15,18 +15,22 @@ from ghgs_lit.cli.reports import Tables, pivot, print_tables, publish, texts
 from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.keys import is_below, key_of
-from ghgs_lit.diagnostics.benchmark.cases import KNOBS, YARDSTICK, Case, cases_of
-from ghgs_lit.diagnostics.benchmark.measure import TOTAL, record_cases
-from ghgs_lit.diagnostics.benchmark.report import broken_budgets, rows_of
+from ghgs_lit.diagnostics.benchmark.cases import KNOBS, REFERENCE, Case, make_cases
+from ghgs_lit.diagnostics.benchmark.measure import TOTAL, Record, record_cases
 from ghgs_lit.diagnostics.machine import in_words, machine_facts
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.results import provenance
+from ghgs_lit.runs.results import Row, provenance, summarize
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Benchmark
 
+#: Metrics besides PSNR in the row ``total`` of a case, if known.
+ERRORS = (
+    "psnr_box", "ssim", "ssim_box", "flip", "flip_box", "lpips", "psnr_box_40", "psnr_edge", "spill",
+    "sharpness", "depth_error_mm",
+)  # fmt: skip
 #: Columns and formats of the table of cases, by heading.
 _COLUMNS = {
     "preset": ("preset", "{}"),
@@ -50,7 +54,7 @@ _COLUMNS = {
     "budget": ("budget", "{}"),
 }
 
-#: Nodes of :data:`KNOBS` that may be set next to a checkpoint, which brings its own model.
+#: Nodes of :data:`KNOBS` that may be set with a checkpoint, which has its own model
 _APPLIED = ("skip", "renderer", "precision")
 
 
@@ -58,11 +62,11 @@ def run(verb: "Benchmark") -> None:
     """Measure the presets on the first subjects of the split; print and write the tables.
 
     Args:
-        verb: the run.
+        verb: the configuration of the run.
 
     Raises:
         InputError: the configuration, a checkpoint or the data is wrong.
-        SystemExit: code 1: a preset exceeds its error budget.
+        SystemExit: code 1: a preset exceeds its budget.
     """
     directory = output_dir()
     verb = with_trained_data(verb)
@@ -71,7 +75,7 @@ def run(verb: "Benchmark") -> None:
     L.seed_everything(verb.seed, workers=True, verbose=False)
     device = pick_device(verb.device)
     torch.set_num_threads(verb.threads or torch.get_num_threads())
-    cases = configured_cases(verb, device)
+    cases = cases_of(verb, device)
     data = build_data(verb)
     data.prepare_data([verb.split])
     number = verb.subjects and math.ceil(verb.subjects / data.dataset.batch_size)
@@ -80,7 +84,7 @@ def run(verb: "Benchmark") -> None:
     if batches[0].targets is None:
         raise InputError(f"targets={verb.targets.name}: expected target photographs; found none")
     records = record_cases(cases, batches, verb.metrics.build().to(device), device, verb.timing.repeats)
-    rows = rows_of(records)
+    rows = make_rows(records)
     broken = {row["preset"]: broken_budgets(row) for row in rows if row["stage"] == TOTAL}
     failures = [f"{preset}: {reason}" for preset, reasons in broken.items() for reason in reasons]
     machine = machine_facts(device)
@@ -105,17 +109,76 @@ def run(verb: "Benchmark") -> None:
         "subjects": [row for record in records for row in record.metrics],
         "provenance": provenance(verb.plain, seed=verb.seed, verb="benchmark", choices=choices()),
     }
-    tables = tables_of(pd.DataFrame(rows), broken)
+    tables = make_tables(pd.DataFrame(rows), broken)
     print_tables(tables)
     publish(directory, "benchmark", notes, tables, content, failures)
 
 
-def tables_of(rows: pd.DataFrame, broken: Mapping[str, Sequence[str]]) -> Tables:
-    """Tables of cost and error of cases, and of the seconds of their stages.
+def make_rows(records: Sequence[Record]) -> list[Row]:
+    """Rows of the tables and of ``benchmark.json``, one for each case (the reference first) and stage. The
+    row ``total`` also has costs, errors and budgets."""
+    rows: list[Row] = []
+    psnr_of_none = summarize(records[0].metrics)[0]["psnr"]
+    for record in records:
+        (means,) = summarize(record.metrics)
+        costs = pd.DataFrame(record.costs)
+        changes = pd.DataFrame(record.changes)
+        worst = changes.max(skipna=False).to_dict() | {"psnr_to_none": changes.psnr_to_none.min()}
+        total = {
+            **costs.mean().to_dict(),
+            "peak_bytes": float(costs.peak_bytes.max()),
+            **{name: worst[name] for name in ("max_rel_diff", "rel_diff")},
+            "psnr": means["psnr"],
+            "psnr_loss_db": psnr_of_none - means["psnr"],
+            "difference_db": difference_db(worst["mse_to_none"], psnr_of_none),
+            "budget_db": record.case.budget_db,
+            "max_rel_diff_budget": record.case.max_rel_diff,
+            "trained": record.case.is_trained,
+            **{name: means[name] for name in ERRORS if name in means},
+            "differences": worst,
+        }
+        for stage, seconds in record.seconds.items():
+            low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
+            row = {"preset": record.case.label, "stage": stage, "seconds": median}
+            row |= {"seconds_low": low, "seconds_high": high, "psnr": None}
+            rows.append(row | total if stage == TOTAL else row)
+    return rows
+
+
+def difference_db(mse: float, psnr: float) -> float:
+    """PSNR in dB, at least 0, that renders lose by a difference that is independent of their error. Unlike
+    the loss against the target images, it cannot be 0 or negative by chance.
 
     Args:
-        rows: of :func:`ghgs_lit.diagnostics.benchmark.report.rows_of`.
-        broken: why a case exceeds its budgets, by its label.
+        mse: mean squared difference of the renders, of colours in [0, 1].
+        psnr: of the renders without the difference, in dB.
+    """
+    return 10 * math.log10(1 + mse * 10 ** (psnr / 10))
+
+
+def broken_budgets(row: Row) -> list[str]:
+    """Reasons why a row ``total`` exceeds its budgets. PSNR is checked for trained weights only."""
+    lines = []
+    loss = row["psnr_loss_db"]
+    if (limit := row["max_rel_diff_budget"]) is not None:
+        loss = max(loss, row["difference_db"])
+        missing = row["differences"]["unmatched"]
+        if not row["rel_diff"] <= limit:
+            lines.append(f"expected rel_diff up to max_rel_diff={limit:g}; found {row['rel_diff']:g}")
+        if missing > 0:
+            lines.append(f"expected the Gaussians of none; found {missing:.2%} others")
+    limit = row["budget_db"]
+    if row["trained"] and limit is not None and not loss <= limit:
+        lines.append(f"expected a loss up to {limit:g} dB of PSNR; found {loss:.3g}")
+    return lines
+
+
+def make_tables(rows: pd.DataFrame, broken: Mapping[str, Sequence[str]]) -> Tables:
+    """Tables of cost and error of the cases, and of the seconds of their stages.
+
+    Args:
+        rows: of :func:`make_rows`.
+        broken: :func:`broken_budgets` of each case, by its label.
     """
     whole = rows[rows.stage == TOTAL]
     has_budget = whole.max_rel_diff_budget.notna() | (whole.trained.astype(bool) & whole.budget_db.notna())
@@ -133,14 +196,14 @@ def tables_of(rows: pd.DataFrame, broken: Mapping[str, Sequence[str]]) -> Tables
 
 
 def check_options(run: "Benchmark", given: Sequence[str]) -> None:
-    """Refuse options of the model next to a checkpoint.
+    """Reject options of the model if there is a checkpoint.
 
     Args:
-        run: as configured.
+        run: its configuration.
         given: overrides of the command line.
 
     Raises:
-        InputError: names the first such key.
+        InputError: with the first such key.
     """
     of_model = [name for name in (*KNOBS, "ablation", "compat") if name not in _APPLIED]
     for key in map(key_of, given if run.checkpoint else ()):
@@ -148,21 +211,21 @@ def check_options(run: "Benchmark", given: Sequence[str]) -> None:
             raise InputError(f"{key}: expected no option of the model with a checkpoint (knobs={{...}})")
 
 
-def configured_cases(run: "Benchmark", device: torch.device) -> list[Case]:
-    """The model in every preset, always including the yardstick.
+def cases_of(run: "Benchmark", device: torch.device) -> list[Case]:
+    """The model with every preset and the reference.
 
     Args:
         run: its configuration.
-        device: where the models are.
+        device: of the models.
 
     Raises:
         FileNotFoundError: there is no such checkpoint.
         InputError: a preset or knob does not exist, or the weights do not fit it.
     """
-    names = dict.fromkeys([YARDSTICK, *run.presets])
+    names = dict.fromkeys([REFERENCE, *run.presets])
     presets = read_options("skip", list(names), run, "presets")
     config = run.plain
     if run.checkpoint is not None:
         applied = {key: config[key] for key in ("renderer", "precision")}
         config = {**read_config(run.checkpoint), **applied}
-    return cases_of(config, run.checkpoint, presets, run.knobs or {}, device, run.seed)
+    return make_cases(config, run.checkpoint, presets, run.knobs or {}, device, run.seed)

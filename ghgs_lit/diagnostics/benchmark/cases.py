@@ -18,8 +18,8 @@ from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
-YARDSTICK = "none"  #: Preset that all others are compared with
-#: Nodes of a configuration that make a case, and that knobs can change
+REFERENCE = "none"  #: Preset that all others are compared with
+#: Nodes of a configuration that define a case; ``knobs`` change keys of them
 KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
 
 
@@ -31,8 +31,8 @@ class Case:
     knobs: Mapping[str, Any]  #: changed values by key
     predictor: Predictor  #: with a model in evaluation mode, on its device
     renderer: Renderer
-    budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: no budget
-    max_rel_diff: float | None  #: allowed difference over its condition; None: any
+    budget_db: float | None  #: PSNR that the preset may lose against the reference; None: no budget
+    max_rel_diff: float | None  #: allowed ``rel_diff`` from the reference; None: any
     is_trained: bool
 
     @property
@@ -42,13 +42,13 @@ class Case:
 
 
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """All combinations of values of the knobs.
+    """All combinations of the values of the knobs.
 
     Args:
         knobs: list of values by dotted key.
 
     Returns:
-        Value by key of each combination; without knobs the empty one.
+        Value by key for each combination; without knobs one empty mapping.
 
     Raises:
         InputError: a knob does not exist, or has no list of values.
@@ -60,7 +60,7 @@ def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(knobs, values, strict=True)) for values in itertools.product(*knobs.values())]
 
 
-def cases_of(
+def make_cases(
     config: Mapping[str, Any],
     checkpoint: str | None,
     presets: Mapping[str, Mapping[str, Any]],
@@ -71,20 +71,20 @@ def cases_of(
     """Cases of a model: every preset with every combination of knobs; they share one copy of the weights.
 
     Args:
-        config: of the model, with the nodes ``renderer`` and ``precision`` of all cases.
-        checkpoint: path of the weights; None: random.
-        presets: values of files of ``conf/skip`` by name, with the yardstick.
+        config: nodes of the model, and ``renderer`` and ``precision``.
+        checkpoint: path of the weights; None: random weights.
+        presets: values of files of ``conf/skip`` by name, the reference among them.
         knobs: list of values by dotted key.
-        device: where the models are.
+        device: of the models.
         seed: of random weights.
 
     Returns:
-        The cases, the yardstick first.
+        The cases, the reference first.
 
     Raises:
-        InputError: the model refuses a preset or knob, or the weights do not fit it.
+        InputError: a preset or knob is not valid for the model, or the weights do not fit it.
     """
-    first = (YARDSTICK, {})
+    first = (REFERENCE, {})
     choices = [
         first,
         *(choice for choice in itertools.product(presets, combinations(knobs)) if choice != first),
@@ -112,8 +112,8 @@ def cases_of(
 def _model(
     config: dict[str, Any], checkpoint: str | None, state: dict[str, Tensor], seed: int, device: torch.device
 ) -> GHGS:
-    """A model with the tensors of ``state``, which are shared, not copied; if that is empty, with those of
-    the checkpoint or random ones."""
+    """A model that shares the tensors of ``state``; if that is empty, with weights of the checkpoint or
+    random ones."""
     if not state and checkpoint is None:
         return random_model(config, seed)
     model = GHGS.from_config(config, empty=True)

@@ -1,4 +1,4 @@
-"""Measurement of cases: work, differences from the yardstick, and seconds of each stage."""
+"""Measurement of cases: cost, differences from the reference, and seconds of each stage."""
 
 import math
 from collections import defaultdict
@@ -31,14 +31,14 @@ ROUNDS = "rounds"
 RENDER = "render"
 TOTAL = "total"
 OTHER = "other"  #: Work outside of stages: checks, padding
-#: Modules of parts of stages, by ``<stage>.<part>``.
+#: Modules that are parts of stages, by ``<stage>.<part>``.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
 #: All timed names in the order of the data flow; those without a dot add up to ``total``.
 NAMES = (*STAGES[:1], *PARTS, *STAGES[1:], ROUNDS, RENDER, OTHER, TOTAL)
 
 
 class SecondsProbe(Stopwatch):
-    """Times of the stages and of the rest."""
+    """Times of the stages, and of all work outside of them."""
 
     def seconds(self) -> dict[str, float]:
         """Seconds by name, in the order of :data:`NAMES`."""
@@ -53,12 +53,7 @@ def top_level(names: Iterable[str]) -> list[str]:
 
 
 def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
-    """Context in which a probe watches the stages of a model and their parts.
-
-    Args:
-        model: has the stages.
-        probe: is called when they begin and end.
-    """
+    """Context in which a probe is called when a stage of a model, or a part of one, begins and ends."""
     names = [*STAGES, *([] if isinstance(model.rounds, NoRounds) else [ROUNDS])]
     return watch_stages(model, {name: name for name in names} | PARTS, probe)
 
@@ -67,13 +62,13 @@ def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
 def forward(
     predictor: Predictor, renderer: Renderer, batch: Batch, probe: Watcher | None = None
 ) -> tuple[Prediction, Rendering]:
-    """Predict the Gaussians of a batch and render its targets under a probe.
+    """Predict the Gaussians of a batch and render its targets.
 
     Args:
-        predictor: with a model in evaluation mode.
-        renderer: draws the targets.
-        batch: with targets, which the model does not see.
-        probe: is called when stages, rendering and the whole begin and end; None: nothing is.
+        predictor: its model is in evaluation mode.
+        renderer: renders from the target cameras.
+        batch: with targets, which are removed before the prediction.
+        probe: is called when stages, the rendering and the whole begin and end.
     """
     probe = probe or Watcher()
     with watched(predictor.model, probe), watch_block(TOTAL, probe):
@@ -84,25 +79,24 @@ def forward(
 
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
-#: Share of the values that budgets judge differences by: where a decision lies within rounding
-#: (which of two points is nearer, whether a splat is drawn at all), single values change as
-#: far as they may.
+#: Share of the values that a budget is compared with: where a decision lies within rounding (which of two
+#: points is nearer, whether a splat is rendered at all), single values change by any amount.
 MOST = 0.99
-#: Random roundings of photographs that :func:`amplification` takes the larger effect of
+#: Number of random roundings of the images in :func:`amplification`
 _ROUNDINGS = 2
 
 
 def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> float:
-    """``|found - expected| / max|expected|``, which a ``share`` of the values does not exceed.
+    """``|found - expected| / max|expected|`` that a share of the values does not exceed.
 
     Args:
-        found: any shape.
+        found: of any shape.
         expected: of the same shape.
-        share: of the values, above 0, at most 1; 1: the largest difference.
+        share: of the values, in (0, 1]; 1: the largest difference.
 
     Returns:
-        The difference; infinite if a value of the difference is not finite, or only ``expected`` is
-        0 everywhere; 0 without values.
+        The difference; infinite if a difference is not finite, or if only ``expected`` is 0 everywhere; 0
+        for empty tensors.
     """
     if found.numel() == 0:
         return 0.0
@@ -114,16 +108,12 @@ def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> 
     return difference / largest if largest > 0 else (0.0 if difference == 0 else math.inf)
 
 
-def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Pair the Gaussians of the same input pixel.
-
-    Args:
-        found: Gaussians of a batch.
-        expected: others of the same batch.
+def match_gaussians(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """Match the Gaussians of two predictions for a batch that belong to the same input pixel.
 
     Returns:
-        Indices of the pairs [n] into both; those without a partner are left out. Without input
-        pixels the first ones of both are pairs.
+        Indices [n] into ``found`` and ``expected``. If either has no input pixels, Gaussians are matched in
+        their order.
     """
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
@@ -139,30 +129,29 @@ Result = tuple[Prediction, Rendering]
 def differences(
     found: Result, expected: Result, masks: Bool[Tensor, "..."], share: float = 1.0
 ) -> dict[str, float]:
-    """Differences of a preset from the yardstick.
+    """Differences of a prediction from a reference.
 
     Args:
-        found: prediction of the preset and its render.
-        expected: those of the yardstick, for the same batch.
-        masks: of the inputs, shape [B, V, H, W].
-        share: as for :func:`relative_difference`; of renders at most :data:`MOST`.
+        found: prediction for a batch, and its render.
+        expected: those of the reference, for the same batch.
+        masks: of the inputs [B, V, H, W].
+        share: as for :func:`relative_difference`; at most :data:`MOST` for renders.
 
     Returns:
-        By name. :func:`relative_difference` of each of :data:`ATTRIBUTES`, of the subject's
-        ``depth`` and of the ``render``; their largest, ``max_rel_diff``; ``mse_to_none`` and
-        ``psnr_to_none`` of the renders, the latter in dB; and ``unmatched``, the Gaussians
-        without a partner (of the preset or the yardstick, whichever has more) over the number of
-        the yardstick's.
+        By name: :func:`relative_difference` of each of :data:`ATTRIBUTES`, of the subject's
+        ``depth`` and of the ``render``; the largest of these, ``max_rel_diff``; mean squared error
+        ``mse_to_none`` and ``psnr_to_none`` (dB) of the renders; and ``unmatched``, the number of
+        Gaussians that are in one prediction only, over that of the reference.
     """
-    (prediction, rendering), (yardstick, reference) = found, expected
+    (prediction, rendering), (reference, target) = found, expected
     ours = prediction.gaussians
-    theirs = yardstick.gaussians
-    a, b = partners(ours, theirs)
+    theirs = reference.gaussians
+    a, b = match_gaussians(ours, theirs)
     result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b], share) for n in ATTRIBUTES}
-    result["render"] = relative_difference(rendering.image, reference.image, min(share, MOST))
-    valid = prediction.depth_valid & yardstick.depth_valid & masks
-    result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid], share)
-    error = squared_error(rendering.image.flatten(0, 1), reference.image.flatten(0, 1)).mean()
+    result["render"] = relative_difference(rendering.image, target.image, min(share, MOST))
+    valid = prediction.depth_valid & reference.depth_valid & masks
+    result["depth"] = relative_difference(prediction.depth[valid], reference.depth[valid], share)
+    error = squared_error(rendering.image.flatten(0, 1), target.image.flatten(0, 1)).mean()
     missing = max(len(theirs), len(ours)) - len(a)
     return {
         **result,
@@ -174,19 +163,17 @@ def differences(
 
 
 def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
-    """Condition of a result: how far most values move where all photographs are rounded
-    once at random.
-
-    Another order of summation rounds as much in every layer.
+    """Condition number of a result: how far :data:`MOST` values change where the input images are rounded at
+    random. Another order of summation causes as large a rounding in every layer.
 
     Args:
-        case: gives the result.
+        case: that gave the result.
         batch: with targets.
-        result: what the case gives for the batch.
+        result: of the case for the batch.
 
     Returns:
-        The movements by the names of :func:`differences`, in units of that rounding, the larger of
-        two roundings; at least 1.
+        Changes by the names of :func:`differences`, in units of the rounding; the larger of two
+        roundings, at least 1.
     """
     eps = torch.finfo(batch.images.dtype).eps
     largest: dict[str, float] = {}
@@ -199,21 +186,23 @@ def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
     return largest
 
 
-def conditioned(found: Result, expected: Result, batch: Batch, condition: Mapping[str, float]) -> float:
-    """Largest difference of attributes, depth and render of :data:`MOST` values over
-    their condition.
+def conditioned_difference(
+    found: Result, expected: Result, batch: Batch, condition: Mapping[str, float]
+) -> float:
+    """Largest of the differences of attributes, depth and render of :data:`MOST` values, each divided by its
+    condition number.
 
     Args:
-        found: prediction of the preset and its render.
-        expected: those of the yardstick.
-        batch: what both are for.
-        condition: from :func:`amplification`.
+        found: prediction for a batch, and its render.
+        expected: those of the reference.
+        batch: the inputs.
+        condition: of the reference, from :func:`amplification`.
     """
     most = differences(found, expected, batch.masks, MOST)
     return max(most[name] / condition[name] for name in (*ATTRIBUTES, "render", "depth"))
 
 
-WARMUP = 1  #: Rounds that do not count; the first compiles and fills caches
+WARMUP = 1  #: Rounds whose times do not count: the first compiles kernels and fills caches
 
 
 @dataclass
@@ -221,11 +210,11 @@ class Record:
     """Measurements of a case.
 
     Attributes:
-        case: what was measured.
+        case: that was measured.
         costs: of each batch, from :func:`inspect`.
-        changes: differences from the yardstick for each batch.
-        metrics: rows of errors against the truth.
-        seconds: of each round that counts, by stage.
+        changes: :func:`differences` of each batch from the reference, and ``rel_diff``.
+        metrics: rows of errors against the target images.
+        seconds: of each round after the warm-up, by stage.
     """
 
     case: Case
@@ -236,27 +225,27 @@ class Record:
 
 
 def flop_counter() -> FlopCounterMode:
-    """Context that counts products, convolutions and attention; not element-wise operations and the
+    """Context that counts products, convolutions and attention; neither element-wise operations nor the
     rasterizer. PyTorch's counter lacks attention on a CPU."""
 
-    def attention(q: tuple, k: tuple, v: tuple, *_: object, **__: object) -> int:
+    def count_attention(q: tuple, k: tuple, v: tuple, *_: object, **__: object) -> int:
         return sdpa_flop_count(q, k, v)
 
     kernels = (attend.packet, torch.ops.aten._scaled_dot_product_flash_attention_for_cpu)
-    return FlopCounterMode(display=False, custom_mapping=dict.fromkeys(kernels, attention))
+    return FlopCounterMode(display=False, custom_mapping=dict.fromkeys(kernels, count_attention))
 
 
 def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[dict[str, float], Result]:
-    """Predict a batch once to count FLOPs and once to measure memory.
+    """Predict and render a batch twice: to count FLOPs, and to measure memory.
 
     Args:
-        case: predicts.
-        batch: with targets, which are rendered.
-        device: where the model and the batch are.
+        case: to run.
+        batch: with targets.
+        device: of the model and the batch.
 
     Returns:
-        FLOPs, peak bytes beyond weights and photographs (NaN where the system has no counter), numbers
-        of tokens, points and Gaussians and bytes of the PLY; the prediction and the render.
+        Cost by name: FLOPs, peak bytes beyond weights and inputs (NaN where the system has no counter),
+        numbers of tokens, points and Gaussians, bytes of the PLY; and the prediction with its render.
     """
     with flop_counter() as counter:
         forward(case.predictor, case.renderer, batch)
@@ -283,15 +272,15 @@ def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[dict[str, f
 def time_cases(
     records: Sequence[Record], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
 ) -> None:
-    """Measure seconds of each stage of each case, in interleaved rounds; each begins with another case, so
-    that drift affects all alike.
+    """Measure the seconds of each stage of each case, in rounds of all cases. Each round begins with another
+    case, so that drift affects all alike.
 
     Args:
-        records: of the cases, which get the seconds.
-        batches: with targets; a round of a case takes the mean over them.
-        warmup: rounds that do not count.
-        repeats: rounds that count, at least 1.
-        device: where models and batches are.
+        records: of the cases; the seconds are appended.
+        batches: with targets; the seconds of a round are the mean over them.
+        warmup: number of rounds whose times are dropped.
+        repeats: number of further rounds, at least 1.
+        device: of models and batches.
     """
     for turn in track(range(-warmup, repeats), "rounds"):
         for number in np.roll(np.arange(len(records)), -turn):
@@ -306,29 +295,31 @@ def time_cases(
 def record_cases(
     cases: Sequence[Case], batches: Sequence[Batch], metrics: ImageMetrics, device: torch.device, repeats: int
 ) -> list[Record]:
-    """Measure work and error of cases, then their times.
+    """Measure cost and error of cases, then their times.
 
     Args:
-        cases: the yardstick first.
+        cases: the reference first.
         batches: with targets.
-        metrics: what is measured against the targets.
-        device: where models and batches are.
-        repeats: rounds of the times that count, at least 1.
+        metrics: of renders against the targets.
+        device: of models and batches.
+        repeats: number of rounds for the times, at least 1.
 
     Returns:
-        The measurements in the order of the cases.
+        Measurements in the order of the cases.
     """
     records = [Record(case) for case in cases]
     for batch in track(batches, "errors"):
         for record in records:
             cost, result = inspect(record.case, batch, device)
             if record is records[0]:
-                yardstick = result
+                reference = result
                 condition = amplification(record.case, batch, result)
-            change = differences(result, yardstick, batch.masks)
+            change = differences(result, reference, batch.masks)
             record.costs.append(cost)
-            record.changes.append(change | {"rel_diff": conditioned(result, yardstick, batch, condition)})
-            # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
+            record.changes.append(
+                change | {"rel_diff": conditioned_difference(result, reference, batch, condition)}
+            )
+            # Errors against the target images, as `ghgs evaluate` measures them; their time does not count.
             prediction, rendering = result
             estimate = Estimate(rendering.image, prediction.depth, prediction.depth_valid)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)

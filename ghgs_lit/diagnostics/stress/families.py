@@ -22,7 +22,7 @@ class Family(NamedTuple):
     ingredient: str | None  #: what it changes; None: it applies to every stage
     text: str  #: describes the inputs
     change: Callable[[Tensor, Generator], Tensor] | None = None
-    """Makes the ingredient from an ordinary one; None: what makes the inputs looks at the family's name."""
+    """Turns an ordinary ingredient into that of the family; None: the code that makes the inputs does it."""
 
 
 def normal(g: Generator, *shape: int) -> Tensor:
@@ -72,7 +72,7 @@ def _large(factor: float) -> Callable[[Tensor, Generator], Tensor]:
 
 
 def _last_mask(change: Callable[[Tensor, Generator], Tensor]) -> Callable[[Tensor, Generator], Tensor]:
-    """Changes the mask of the last view of masks [v, h, w]."""
+    """Change of the mask of the last view of masks [v, h, w]."""
     return lambda x, g: torch.cat((x[:-1], change(x[-1:], g)))
 
 
@@ -149,13 +149,13 @@ COUNTS = {"few": 4, "single": 1}  #: Numbers of points by family
 
 
 def vary(ingredient: str, family: str, ordinary: Tensor, g: Generator) -> Tensor:
-    """Values of an ingredient, changed if the family is one of this ingredient.
+    """Values of an ingredient for a case of a family, which changes those of its own ingredient only.
 
     Args:
-        ingredient: of which ``ordinary`` is.
+        ingredient: of the values.
         family: of the case.
         ordinary: values as in training.
-        g: source of further random numbers.
+        g: of the random numbers.
     """
     chosen = FAMILIES[family]
     is_changed = chosen.ingredient == ingredient and chosen.change is not None
@@ -163,16 +163,16 @@ def vary(ingredient: str, family: str, ordinary: Tensor, g: Generator) -> Tensor
 
 
 def depths(family: str, g: Generator, *shape: int) -> Tensor:
-    """Depths of about two units of the scene."""
+    """Depths of about two units of the scene, of a shape."""
     return vary("depths", family, uniform(g, 1.5, 2.5, *shape) * UNITS.get(family, 1.0), g)
 
 
 def rig(family: str, g: Generator, views: int, size: int) -> Values:
-    """Cameras on a circle around the middle of a scene, two units from it (further if "long").
+    """Cameras on a circle around the middle of a scene, two units from it (further away for ``long``).
 
     Args:
         family: of the case.
-        g: source of random numbers.
+        g: of the random numbers.
         views: number of cameras.
         size: side of the images in pixels.
 
@@ -218,11 +218,11 @@ def cameras_of(v: Values, size: int, prefix: str = "") -> Cameras:
 
 
 def points(family: str, g: Generator, count: int, scene: Values) -> Tensor:
-    """World points [count, 3] around the middle of a scene, or at a place before its first camera.
+    """World points [count, 3] around the middle of a scene, or placed relative to its first camera.
 
     Args:
         family: of the case.
-        g: source of random numbers.
+        g: of the random numbers.
         count: number of points.
         scene: of :func:`rig`.
     """
@@ -235,24 +235,24 @@ def points(family: str, g: Generator, count: int, scene: Values) -> Tensor:
 
 
 def scene_points(family: str, g: Generator) -> Values:
-    """A camera for 16 x 16 pixels, and ``points`` before it."""
+    """:func:`rig` of one camera with 16 x 16 pixels, and ``points``."""
     scene = rig(family, g, 1, 16)
     return {**scene, "points": points(family, g, COUNTS.get(family, 20), scene)}
 
 
 def sphere(family: str, g: Generator, views: int, size: int, target: bool = False) -> Values:
-    """Images, masks and true depths of a sphere of 0.5 units.
+    """Images, masks and true depths of a sphere with a radius of 0.5 units.
 
     Args:
         family: of the case.
-        g: source of random numbers.
+        g: of the random numbers.
         views: number v of input views.
         size: side s of the images in pixels.
-        target: whether there is a target view, too.
+        target: whether to add a target view.
 
     Returns:
         ``images`` [v, 3, s, s], ``masks`` and ``truth`` [v, s, s] (true depths, 0 outside the
-        sphere), and what :func:`rig` has; with a target ``target`` [1, 3, s, s],
+        sphere), and the values of :func:`rig`; with a target also ``target`` [1, 3, s, s],
         ``target_lenses`` and ``target_poses``.
     """
     scene = rig(family, g, views + target, size)
@@ -278,5 +278,5 @@ def sphere(family: str, g: Generator, views: int, size: int, target: bool = Fals
 
 
 def batch_of(v: Values) -> Batch:
-    """Batch of stacked cases of :func:`sphere`, without their targets."""
+    """Batch of stacked cases of :func:`sphere`, without targets."""
     return Batch(v["images"], v["masks"], cameras_of(v, v["images"].shape[-1]))

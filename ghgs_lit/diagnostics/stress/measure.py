@@ -17,7 +17,7 @@ from ghgs_lit.runs.results import to_json_data
 
 #: Precisions of the runs; the last two are autocast, with inputs in float32.
 DTYPES = ("float32", "bfloat16", "float16")
-#: Families with a value that is not finite, which must be rejected or be visible in the outputs.
+#: Families with a value that is not finite: the stage must reject it, or outputs must not be finite.
 PLANTED = {"nan": math.nan, "inf": math.inf}
 #: Largest relative difference of gradients in float64 from central differences.
 SLOPES = 1e-3
@@ -25,8 +25,8 @@ SLOPES = 1e-3
 _STEP = torch.finfo(torch.float32).eps
 
 #: A cell of the matrix: ``stage``, ``family``, ``dtype``; numbers of ``cases`` and ``failures``;
-#: largest ``error`` in units of eps times the condition number (None: unbounded); ``budget``, the allowed
-#: factor; ``worst``, the output and seed of the largest error.
+#: largest ``error`` in units of eps times the condition number (None: infinite); ``budget``, the largest
+#: allowed error; ``worst``, the output and seed of the largest error.
 Row = dict[str, Any]
 Errors = tuple[Tensor, list[str]]  #: Errors [n] of n cases in these units, and the output that has each
 
@@ -35,28 +35,28 @@ Errors = tuple[Tensor, list[str]]  #: Errors [n] of n cases in these units, and 
 class Stage:
     """A function that is compared with itself in float64.
 
-    The budget of a case is ``factor * eps * kappa`` of each output and gradient (its largest
-    entry). ``kappa`` is the condition number at the case's inputs: the change of the float64 results
-    under random roundings of the inputs, in units of eps.
+    The largest error of each output and gradient of a case may be ``factor * eps * kappa``. ``kappa`` is
+    the condition number of the case: the change of the float64 results under random roundings of the
+    inputs, in units of eps.
 
     Args:
-        ingredients: what the inputs contain; families of other ingredients do not apply.
+        ingredients: of the inputs; families of other ingredients do not apply.
         make: makes the inputs of one case in float64, from a family and a generator.
-        run: computes outputs [n, ...] of n stacked cases in the dtype of the inputs, or by a kernel in
-            float32 and by its plain form in float64.
+        run: computes outputs [n, ...] of n stacked cases in the dtype of the inputs; or in float32 by a
+            kernel and in float64 by its plain form.
         factor: of the budget, at most 100.
         reason: of the factor.
-        gradients: inputs whose gradients are compared, too.
-        steady: inputs that are not rounded for kappa.
-        seeds: number of cases of each family and dtype in the full run;
-            a quick run misses rare failures.
-        is_network: whether the stage computes in autocast's dtype; others compute in float32 or wider.
+        gradients: inputs whose gradients are also compared.
+        steady: inputs that are neither rounded for kappa nor replaced by values that are not finite.
+        seeds: number of cases of each family and dtype in the full run.
+        is_network: whether the stage computes in the dtype of autocast; others compute in float32 or
+            wider.
         kappa: lower bound of the condition number [n] (or [1], of all cases),
             where the stage's definition subtracts large numbers.
-        sizes: magnitude [n] of terms that cancel in the gradients by definition; where these are
-            not unique and must only be finite, the largest number.
+        sizes: magnitude [n] of terms of the gradients that cancel by definition; the largest float64 where
+            gradients are not unique, and need only be finite.
         without: families that do not apply although their ingredient does.
-        silent: why a value that is not finite need not be visible in the outputs; empty: it must.
+        silent: why outputs may be finite although an input is not; empty: they must not.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Stage:
         return [n for n, family in FAMILIES.items() if family.ingredient in known and n not in self.without]
 
     def rounded(self, cases: Values) -> list[str]:
-        """Names of the inputs that are rounded for kappa, and may get a value that is not finite."""
+        """Names of the inputs that are rounded for kappa or replaced by values that are not finite."""
         return [n for n, value in cases.items() if value.is_floating_point() and n not in self.steady]
 
 
@@ -96,7 +96,7 @@ def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
 
 
 def measure(stage: Stage, family: str, seeds: int, dtypes: Sequence[str] = DTYPES) -> list[Row]:
-    """Cells of a stage and family, one for each dtype. What a stage raises is a failure of all its cases."""
+    """Cells of a stage and family, one for each dtype. An exception is a failure of all its cases."""
     # A case depends on stage, family and seed only.
     keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in range(seeds)]
     cases = default_collate([stage.make(family, Generator().manual_seed(key)) for key in keys])
@@ -107,7 +107,7 @@ def measure(stage: Stage, family: str, seeds: int, dtypes: Sequence[str] = DTYPE
             results = [_plant(stage, PLANTED[family], cases, dtype) for dtype in dtypes]
         else:
             results = _compare(stage, family, cases, dtypes)
-    except Exception as error:  # whatever a stage raises is a failure of its own, and the others go on
+    except Exception as error:  # a failure of this stage; the others are measured
         is_rejected = family == "out_of_range" and isinstance(error, InputError)
         message = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         results = [(torch.full((seeds,), 0.0 if is_rejected else math.inf), [message] * seeds)] * len(dtypes)
@@ -124,9 +124,9 @@ def evaluate(stage: Stage, inputs: Values, dtype: str) -> tuple[Values, Tensor]:
     """Run a stage, and differentiate a weighted sum of all its outputs.
 
     Args:
-        stage: is run.
+        stage: to run.
         inputs: [n, ...] by name, in float32 or float64.
-        dtype: of autocast, if it is one of the last of :data:`DTYPES`.
+        dtype: of autocast, if it is a half precision.
 
     Returns:
         Outputs by name, and gradients as ``d <input>``, in float64; and the sums [n].
@@ -206,7 +206,7 @@ def condition(stage: Stage, exact: Values, truth: Values) -> Values:
     them flips any decision within it (a ray that grazes a box).
 
     Args:
-        stage: with the inputs that are steady, and the budget.
+        stage: has the budget, and the names of the inputs to round.
         exact: inputs [n, ...] by name in float64.
         truth: outputs and gradients in float64.
 
@@ -231,9 +231,11 @@ def condition(stage: Stage, exact: Values, truth: Values) -> Values:
 
 
 def _plant(stage: Stage, value: float, cases: Values, dtype: str) -> Errors:
-    """Plant a value that is not finite in one entry of one input of each case, next to another case. The
-    error is 0 where it is rejected, or visible in the outputs (unless the stage is silent) and in those
-    of no other case; else it is infinite."""
+    """Errors where one entry of one input of each case is not finite. Each is stacked with another case.
+
+    The error is 0 where the stage rejects the value, or where outputs of the other case are finite and those
+    of this case are not (or the stage is silent); else it is infinite.
+    """
     names = stage.rounded(cases)
     count = len(cases[names[0]])
     errors = torch.zeros(count)

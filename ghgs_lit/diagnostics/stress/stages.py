@@ -1,4 +1,4 @@
-"""Stages of geometry, heads, recalibration, rendering, losses and metrics; all but those of whole models."""
+"""Stages of geometry, heads, recalibration, rendering, losses and metrics; all but whole models."""
 
 import copy
 import math
@@ -23,25 +23,17 @@ from ghgs_lit.diagnostics.stress.families import (
     vary,
 )
 from ghgs_lit.diagnostics.stress.measure import Stage, case_by_case
-from ghgs_lit.geometry.chamfer import chamfer
+from ghgs_lit.geometry import chamfer, masks, precision, projection, rotations, unprojection
 from ghgs_lit.geometry.frame import Frame, to_world
-from ghgs_lit.geometry.masks import relative_bounds, relative_depth
-from ghgs_lit.geometry.precision import exact
-from ghgs_lit.geometry.projection import project, sample, unproject, world_to_camera
-from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
-from ghgs_lit.geometry.unprojection import subject_tokens
-from ghgs_lit.method.bounds import VisualHull
-from ghgs_lit.method.bounds.rays import depths_in_box, ray_directions
-from ghgs_lit.method.heads.attributes import OFFSET_UNIT, FootprintAttributes
+from ghgs_lit.method.bounds import VisualHull, rays
+from ghgs_lit.method.heads import attributes, dpt
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth
-from ghgs_lit.method.heads.dpt import DPTHead
 from ghgs_lit.method.recalibration import SemanticAttention
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import psnr, ssim
-from ghgs_lit.ops.activation import confidence_of, footprint_attributes
+from ghgs_lit.ops import activation, neighbors
 from ghgs_lit.ops.attention.cpu import attend_heads
 from ghgs_lit.ops.compile import processor_features
-from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.rendering import render
 from ghgs_lit.types import DepthBounds, DepthMaps, Gaussians, Tokens
@@ -52,8 +44,8 @@ SEEN = (*CAMERAS, "points", "points seen")
 
 
 def _project(v: Values) -> Values:
-    pixels, z = project(v["points"], *matrices(v))
-    camera = world_to_camera(v["points"], matrices(v)[1])
+    pixels, z = projection.project(v["points"], *matrices(v))
+    camera = projection.world_to_camera(v["points"], matrices(v)[1])
     return {"camera": camera, "pixels": torch.where(z[..., None] > 0, pixels, 0.0)}
 
 
@@ -68,14 +60,14 @@ def _box(family: str, g: Generator) -> Values:
 
 def _rays(v: Values) -> Values:
     cameras = cameras_of(v, 4)
-    with exact("cpu"):  # as in the stage
-        bounds = depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
-        return {"directions": ray_directions(cameras), "near": bounds.near, "far": bounds.far}
+    with precision.exact("cpu"):  # as in the stage
+        bounds = rays.depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
+        return {"directions": rays.ray_directions(cameras), "near": bounds.near, "far": bounds.far}
 
 
 def _bounds(v: Values) -> Values:
-    """Bounds of the subject's pixels, computed in the subject's frame as the model does; infinite where the
-    true surface is outside of them."""
+    """Bounds of the subject's pixels, computed in its frame as in the model; infinite where the true surface
+    is outside of them."""
     batch = batch_of(v)
     frame = Frame.of(batch)
     bounds = VisualHull(dilation=0.02)(frame.enter(batch))
@@ -100,9 +92,9 @@ def _maps(family: str, g: Generator) -> Values:
 
 
 def _sample(v: Values) -> Values:
-    pixels, z = project(v["points"], *matrices(v))
+    pixels, z = projection.project(v["points"], *matrices(v))
     image = torch.arange(len(v["maps"]))[:, None].expand(v["points"].shape[:2])
-    return {"values": sample(v["maps"], image, torch.where(z[..., None] > 0, pixels, 1e9))}
+    return {"values": projection.sample(v["maps"], image, torch.where(z[..., None] > 0, pixels, 1e9))}
 
 
 def _near_surface(family: str, g: Generator) -> Values:
@@ -111,7 +103,7 @@ def _near_surface(family: str, g: Generator) -> Values:
 
 
 def _photo(v: Values) -> Values:
-    """Disagreement, whose error relates to 1 however small the agreement is."""
+    """Disagreement: its error is relative to 1 also where the agreement is near 0."""
     return {"disagreement": 1 - photo_consistency(batch_of(v), DepthBounds(v["near"], v["far"]), 3)}
 
 
@@ -124,13 +116,13 @@ def _depth_maps(family: str, g: Generator) -> Values:
 
 def _tokens(v: Values) -> Values:
     maps = DepthMaps(v["depth"], v["masks"], torch.ones_like(v["depth"]))
-    pixels, depth, valid = subject_tokens(maps, 4)
+    pixels, depth, valid = unprojection.subject_tokens(maps, 4)
     return {"pixels": torch.where(valid[..., None], pixels, 0.0), "depth": torch.where(valid, depth, 0.0)}
 
 
 def _relative(v: Values) -> Values:
-    bounds = relative_bounds(DepthBounds(v["depth"], v["far"]), v["masks"])
-    return {"relative": relative_depth(v["depth"], v["masks"]), "bounds": bounds}
+    bounds = masks.relative_bounds(DepthBounds(v["depth"], v["far"]), v["masks"])
+    return {"relative": masks.relative_depth(v["depth"], v["masks"]), "bounds": bounds}
 
 
 def _raw_depths(family: str, g: Generator) -> Values:
@@ -142,7 +134,7 @@ def _raw_depths(family: str, g: Generator) -> Values:
 
 def _depth(v: Values) -> Values:
     depths = {name: bounded_depth(v["raw"], v["near"], v["far"], name) for name in BOUNDED}
-    return {**depths, "confidence": confidence_of(v["confidence"])}
+    return {**depths, "confidence": activation.confidence_of(v["confidence"])}
 
 
 _RAW = {"offset": (16, 3), "scale": (16, 3), "rotation": (16, 4), "opacity": (16,)}
@@ -155,7 +147,9 @@ def _raw_attributes(family: str, g: Generator) -> Values:
 
 def _attributes(v: Values) -> Values:
     raw = (v[name].flatten(0, 1) for name in (*_RAW, "footprint"))
-    rows = footprint_attributes(*raw, FootprintAttributes().constants(OFFSET_UNIT, 0.0))
+    rows = activation.footprint_attributes(
+        *raw, attributes.FootprintAttributes().constants(attributes.OFFSET_UNIT, 0.0)
+    )
     return {name: value.unflatten(0, v["opacity"].shape) for name, value in zip(_RAW, rows, strict=True)}
 
 
@@ -169,7 +163,7 @@ def _splat_axes(family: str, g: Generator) -> Values:
 
 
 def _covariance(v: Values) -> Values:
-    rotation = quaternion_to_matrix(v["quaternions"])
+    rotation = rotations.quaternion_to_matrix(v["quaternions"])
     root = rotation * v["scales"][..., None, :]
     return {"rotation": rotation, "covariance": (root[..., :, None, :] * root[..., None, :, :]).sum(-1)}
 
@@ -179,7 +173,7 @@ _LAYERS = tuple(f"layer{i}" for i in range(4))
 
 with torch.random.fork_rng(devices=[]):
     torch.manual_seed(5)
-    _HEAD = DPTHead(32, 3, widths=(8, (4, 8, 8, 8))).requires_grad_(False)
+    _HEAD = dpt.DPTHead(32, 3, widths=(8, (4, 8, 8, 8))).requires_grad_(False)
 HEADS = {torch.float32: _HEAD, torch.float64: copy.deepcopy(_HEAD).double()}
 
 
@@ -205,20 +199,20 @@ def _cloud(family: str, g: Generator) -> Values:
 
 
 def _distances(v: Values) -> Values:
-    near = nearest_neighbors(v["points"], v["view"], _K)
+    near = neighbors.nearest_neighbors(v["points"], v["view"], _K)
     points = v["points"].double()
     return {"all": (points[near] - points[:, None]).norm(dim=-1)}
 
 
 def _ties(v: Values) -> Tensor:
-    """The largest number where several points are at one place, so that any of them may be the nearest."""
+    """The largest number where several points coincide, so that any of them may be the nearest."""
     apart = (v["points"][:, :, None] - v["points"][:, None]).abs().sum(-1)
     is_tied = (apart == 0).flatten(1).sum(1) > apart.shape[1]
     return is_tied * torch.tensor(torch.finfo(torch.float64).max, dtype=torch.float64)
 
 
 def _neighbor_table(family: str, g: Generator) -> Tensor:
-    """Indices [count, k] of different tokens for each."""
+    """Indices [count, k] of the neighbours of each token, all different."""
     count = COUNTS.get(family, 12)
     return torch.stack([torch.randperm(count, generator=g)[:_K] for _ in range(count)])
 
@@ -243,17 +237,16 @@ BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped"
 
 
 def _attention(v: Values) -> Values:
-    """Eq. 3 with every use of the similarity."""
+    """Eq. 3 with each way to use the similarity."""
     inputs = [v[name] for name in ("q", "k", "v", "index")]
     return {
-        name: attend_to_neighbors(*inputs, block.num_heads, *block.factor_and_bias(v["cosines"]))
+        name: neighbors.attend_to_neighbors(*inputs, block.num_heads, *block.factor_and_bias(v["cosines"]))
         for name, block in BLOCKS.items()
     }
 
 
 def _products(v: Values) -> Tensor:
-    """Size of the products of a value and a query or key,
-    whose mean a softmax's gradient subtracts."""
+    """Size of the products of a value and a query or key: the gradient of a softmax subtracts their mean."""
     q, k, value = (v[name].abs().flatten(1).amax(1) for name in ("q", "k", "v"))
     return torch.maximum(q, k) * value
 
@@ -277,7 +270,7 @@ def gaussians_of(v: Values) -> Gaussians:
 
 
 def backend_of(values: Tensor) -> str:
-    """Plain renderer in float64, kernels in float32."""
+    """Renderer for a dtype: plain PyTorch in float64, kernels in float32."""
     return "reference" if values.dtype == torch.float64 else "cpu"
 
 
@@ -338,7 +331,7 @@ STAGES = [
     ),
     Stage(
         "unprojection", (*CAMERAS, "depths"), _pixels,
-        lambda v: {"points": unproject(v["pixels"], v["depth"], *matrices(v))}, 20, _HOLDS,
+        lambda v: {"points": projection.unproject(v["pixels"], v["depth"], *matrices(v))}, 20, _HOLDS,
         gradients=("pixels", "depth", "lenses", "poses"), steady=("middle",),
         silent="an infinite focal length is a ray along the axis; the model refuses it",
     ),
@@ -387,7 +380,7 @@ STAGES = [
         silent=_BOUNDED,
     ),
     Stage(
-        "unit vectors", ("quaternions",), _vectors, lambda v: {"unit": unit(v["vectors"])}, 20,
+        "unit vectors", ("quaternions",), _vectors, lambda v: {"unit": rotations.unit(v["vectors"])}, 20,
         "one square root and one division", gradients=("vectors",),
     ),
     Stage(
@@ -406,7 +399,7 @@ STAGES = [
     ),
     Stage(
         "cosine", ("features", "neighbors"), _token_features,
-        case_by_case(lambda v: {"cosines": neighbor_cosines(v["features"], v["index"])}), 20,
+        case_by_case(lambda v: {"cosines": neighbors.neighbor_cosines(v["features"], v["index"])}), 20,
         "a product of two unit vectors of 16 components",
     ),
     Stage(
@@ -432,7 +425,7 @@ STAGES = [
     ),
     Stage(
         "Chamfer", ("place", "points", "neighbors"), _cloud,
-        case_by_case(lambda v: {"chamfer": chamfer(v["points"], v["surface"])}), 20,
+        case_by_case(lambda v: {"chamfer": chamfer.chamfer(v["points"], v["surface"])}), 20,
         "means of squares of differences", gradients=("points", "surface"), seeds=96, sizes=_ties,
     ),
     Stage(

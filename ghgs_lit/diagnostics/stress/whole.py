@@ -1,5 +1,5 @@
-"""Stages of the whole method: gains, refinement, tiny models, and a training step through renderer and
-losses."""
+"""Stages of the whole method: gains, refinement, predictions of tiny and shipped models, and training steps
+through renderer and losses."""
 
 import copy
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from ghgs_lit.config import run_of
+from ghgs_lit.diagnostics.stress import stages
 from ghgs_lit.diagnostics.stress.families import (
     FAMILIES,
     Values,
@@ -21,8 +22,6 @@ from ghgs_lit.diagnostics.stress.families import (
     vary,
 )
 from ghgs_lit.diagnostics.stress.measure import Stage, case_by_case
-from ghgs_lit.diagnostics.stress.stages import STAGES as PARTS
-from ghgs_lit.diagnostics.stress.stages import backend_of
 from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.projection import unproject_maps
@@ -41,8 +40,8 @@ _TINY += ("encoder.vit.channels=8", "recalibration.k=4", "recalibration.num_head
 
 
 def _surface(views: int, size: int, family: str, g: Generator) -> Values:
-    """A sphere with the same colours in all views, up to their ``gains`` [v, 3], where the family is
-    none of images; and ``opacities`` [v, s, s] of its splats."""
+    """A sphere with the same colours in all views (unless the family is one of images), ``gains`` [v, 3] of
+    the views, and ``opacities`` [v, s, s] of splats on it."""
     values = sphere(family, g, views, size)
     if FAMILIES[family].ingredient != "images":
         one = {name: value[None] for name, value in values.items()}
@@ -54,7 +53,7 @@ def _surface(views: int, size: int, family: str, g: Generator) -> Values:
 
 
 def _seen(v: Values) -> tuple[Gaussians, Batch]:
-    """Splats of a pixel's size on the true surface of one case, and its input views, darker by gains."""
+    """Splats of a pixel's size on the true surface of one case, and its input views times the gains."""
     one = {name: value[None] for name, value in v.items()}
     one["images"] = one["images"] * one["gains"][..., None, None]
     batch = batch_of(one)
@@ -68,8 +67,8 @@ def _gains(v: Values) -> Values:
 
 
 def _refine(v: Values) -> Values:
-    """Renders after two steps: what no photograph shows moves by the sign of rounding."""
-    backend = backend_of(v["images"])
+    """Renders after two steps; not Gaussians, since those that no view shows move by the sign of rounding."""
+    backend = stages.backend_of(v["images"])
     gaussians, batch = _seen(v)
     refined = Refinement(2, Renderer(backend=backend))(gaussians, batch)
     rendering = render(refined, batch.cameras, backend)
@@ -78,13 +77,12 @@ def _refine(v: Values) -> Values:
 
 @cache
 def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
-    """A model in both precisions, with the weights of the package or tiny.
-
-    A tiny one has random weights instead of the layers of 0 of its initialisation.
+    """A model in float32 and float64: the shipped one, or a tiny one with random weights also in layers that
+    are initialised with 0.
 
     Args:
         name: a file of ``conf/model``, or :data:`SHIPPED`.
-        kicked: whether every weight is moved by 10.
+        kicked: whether 10 is added to or subtracted from every weight.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
@@ -104,8 +102,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
 
 
 def _in_float32(bounds: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds computed in float32, so that their decisions, tested in a stage of their own,
-    agree."""
+    """Bounds computed in float32, so that their decisions, which another stage tests, are equal."""
     computed = bounds(replace(batch, cameras=batch.cameras.to(torch.float32)))
     return computed if computed is None else DepthBounds(computed.near.double(), computed.far.double())
 
@@ -115,7 +112,7 @@ def _scene(family: str, g: Generator) -> Values:
 
 
 def _dense(prediction: Prediction, batch: Batch) -> Values:
-    """Depths and Gaussians as maps; 0 where there are none, NaN for lost depths of the subject."""
+    """Depths and Gaussians as maps: 0 where there are none, NaN where a depth of the subject is not valid."""
     gaussians = prediction.gaussians
     size = batch.masks.shape
     parts = (gaussians.means, gaussians.scales, gaussians.opacities[:, None], gaussians.colors)
@@ -150,7 +147,7 @@ def _step(name: str, v: Values) -> Values:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)  # for the number of rounds
         prediction = Predictor(model)(batch)
-    rendering = render(prediction.gaussians, cameras, backend_of(one["images"]))
+    rendering = render(prediction.gaussians, cameras, stages.backend_of(one["images"]))
     total, values = _LOSSES(prediction, rendering, batch)
     slopes = torch.autograd.grad(total, list(model.parameters()), allow_unused=True)
     gradient = torch.cat([slope.flatten() for slope in slopes if slope is not None])
@@ -158,14 +155,14 @@ def _step(name: str, v: Values) -> Values:
 
 
 def _far(v: Values) -> Tensor:
-    """Condition number of points, sums of a camera's centre and a depth in float32: the distance
-    over the subject's size, of whose depth one half is seen."""
+    """Condition number of points, which are sums of a camera's centre and a depth: the distance over the
+    subject's size, of which the views show one half in depth."""
     depth = v["truth"].flatten(1)
     nearest = torch.where(depth > 0, depth, torch.inf).amin(1)
     return depth.amax(1) / (2 * (depth.amax(1) - nearest))
 
 
-#: What all stages of photographs share. The subject of "wide" is smaller than a pixel.
+#: Shared by all stages of input views. In ``wide`` the subject is smaller than a pixel.
 _stage = partial(
     Stage,
     ingredients=("place", "cameras", "images", "masks", "weights", "opacities"),
@@ -174,7 +171,7 @@ _stage = partial(
     without=("wide", "degenerate"),
     silent="what is not read, drawn or seen by another view has no effect",
 )
-# These stages have a subject in metres.
+# These stages need a subject in metres.
 _surface_stage = partial(
     _stage,
     steady=("middle", "truth"),
@@ -214,4 +211,4 @@ WHOLE = (
 )
 
 #: All stages by their names.
-STAGES = {stage.name: stage for stage in (*PARTS, *WHOLE)}
+STAGES = {stage.name: stage for stage in (*stages.STAGES, *WHOLE)}

@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from ghgs_lit.cli.benchmark import broken_budgets
 from ghgs_lit.diagnostics.benchmark import measure
 from ghgs_lit.diagnostics.benchmark.cases import Case, combinations
 from ghgs_lit.diagnostics.benchmark.measure import (
@@ -19,17 +20,16 @@ from ghgs_lit.diagnostics.benchmark.measure import (
     Record,
     SecondsProbe,
     amplification,
-    conditioned,
+    conditioned_difference,
     differences,
     flop_counter,
     forward,
-    partners,
+    match_gaussians,
     relative_difference,
     time_cases,
     top_level,
     watched,
 )
-from ghgs_lit.diagnostics.benchmark.report import broken_budgets
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
@@ -47,6 +47,17 @@ def scene():
 @pytest.fixture(scope="module")
 def model():
     return Predictor(make_model().eval())
+
+
+@pytest.fixture(scope="module")
+def probe():
+    return SecondsProbe(CPU)
+
+
+@pytest.fixture(scope="module")
+def result(model, scene, probe):
+    """Prediction and render, with their times in the probe."""
+    return forward(model, Renderer(), scene, probe)
 
 
 def case(model, name, renderer):
@@ -70,10 +81,8 @@ def test_cases_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, mon
         assert {len(seconds) for seconds in record.seconds.values()} == {2}
 
 
-def test_stages_and_the_rest_add_up_to_the_total(model, scene):
-    """Time that no stage has must be seen, not be lost."""
-    probe = SecondsProbe(CPU)
-    forward(model, Renderer(), scene, probe)
+def test_stages_and_the_rest_add_up_to_the_total(result, probe):
+    """Time outside of all stages is not lost."""
     seconds = probe.seconds()
     assert list(seconds) == [name for name in NAMES if name != ROUNDS]
     assert sum(seconds[name] for name in top_level(seconds)) + seconds[OTHER] == pytest.approx(seconds[TOTAL])
@@ -81,13 +90,11 @@ def test_stages_and_the_rest_add_up_to_the_total(model, scene):
     assert seconds[OTHER] >= 0
 
 
-def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene):
-    """A model that was measured must not stay slower, or become another one."""
+def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene, result):
+    """Hooks are removed after a measurement, and do not change the prediction."""
     bounds = model.model.bounds
-    with torch.no_grad():  # as it is measured: kernels round otherwise than PyTorch
-        before = model(scene)
-    found, _ = forward(model, Renderer(), scene, SecondsProbe(CPU))
-    close(found.gaussians, before.gaussians, 0)
+    with torch.no_grad():  # as in the measurement: kernels round otherwise than PyTorch
+        close(result[0].gaussians, model(scene).gaussians, 0)
     with watched(model.model, SecondsProbe(CPU)):
         assert model.model.bounds is not bounds
         assert model.model.bounds.samples == bounds.samples
@@ -145,10 +152,8 @@ def test_budgets(change, broken):
     assert all(line.startswith(f"expected {text}") for line, text in zip(lines, broken, strict=True))
 
 
-def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scene, monkeypatch):
-    """A depth that changes 64 times as much as the photographs has a condition of 64,
-    what is fixed 1."""
-    result = forward(model, Renderer(), scene, SecondsProbe(CPU))
+def test_the_condition_is_what_a_rounding_of_the_images_changes(model, scene, result, monkeypatch):
+    """A depth that changes 64 times as much as the images has a condition of 64, a constant one of 1."""
     place = scene.images.argmax()
 
     def moved(model, renderer, batch):
@@ -158,31 +163,29 @@ def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scen
 
     monkeypatch.setattr(measure, "forward", moved)
     found = amplification(case(model, "none", Renderer()), scene, result)
-    # Photographs of 1 at most: between half of eps and eps.
+    # The brightest pixel is below 1: its rounding is between half of eps and eps.
     assert 30 < found["depth"] < 66
     assert all(found[name] == 1 for name in (*ATTRIBUTES, "render"))
     twice = [dataclasses.replace(result[0], depth=result[0].depth * (1 + factor)) for factor in (1e-3, 2e-3)]
-    first, second = (conditioned((one, result[1]), result, scene, found) for one in twice)
+    first, second = (conditioned_difference((one, result[1]), result, scene, found) for one in twice)
     assert first == pytest.approx(1e-3 / found["depth"], rel=0.1)
     assert second == pytest.approx(2 * first, rel=1e-3)
 
 
-def test_gaussians_are_compared_by_their_pixel(model, scene):
-    """A preset that drops some Gaussians, or orders them otherwise,
-    is compared on those that it has."""
-    expected = forward(model, Renderer(), scene, SecondsProbe(CPU))
-    gaussians = expected[0].gaussians
+def test_gaussians_are_compared_by_their_pixel(scene, result):
+    """A preset that drops some Gaussians, or orders them otherwise, is compared on the others."""
+    gaussians = result[0].gaussians
     kept = torch.arange(len(gaussians)).flip(0)[: len(gaussians) // 2]
-    found = dataclasses.replace(expected[0], gaussians=gaussians.select(kept, (len(kept),)))
-    a, b = partners(found.gaussians, gaussians)
+    found = dataclasses.replace(result[0], gaussians=gaussians.select(kept, (len(kept),)))
+    a, b = match_gaussians(found.gaussians, gaussians)
     assert torch.equal(kept[a], b)
-    changes = differences((found, expected[1]), expected, scene.masks)
+    changes = differences((found, result[1]), result, scene.masks)
     assert all(changes[name] == 0 for name in (*ATTRIBUTES, "render", "depth", "max_rel_diff"))
     assert changes["unmatched"] == pytest.approx(0.5, abs=1 / len(gaussians))
     assert changes["psnr_to_none"] == pytest.approx(100)
     nothing = gaussians.select(kept[:0], (0,))
-    assert [len(index) for index in partners(nothing, gaussians)] == [0, 0]
-    assert [len(index) for index in partners(gaussians, nothing)] == [0, 0]
+    assert [len(index) for index in match_gaussians(nothing, gaussians)] == [0, 0]
+    assert [len(index) for index in match_gaussians(gaussians, nothing)] == [0, 0]
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_a_changed_line_is_reported(defect, monkeypatch):
 
 def test_a_confidence_without_its_limit_is_reported(monkeypatch):
     """exp(100) is infinite in float32, and is not in float64."""
-    monkeypatch.setattr(stages, "confidence_of", lambda c: 1 + c.exp())
+    monkeypatch.setattr(stages.activation, "confidence_of", lambda c: 1 + c.exp())
     assert failures("depth activation", "saturated", "float32") > 0
 
 
