@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ghgs_lit.errors import require
@@ -38,13 +37,6 @@ NEAR = {
     "opacities": Change(2.0, 0.04),
     "colors": Change(0.05, 0.001),
 }
-#: Factor of a pixel's missing fine detail that is finally added to the colour of its Gaussian. Above
-#: 1, since a pixel shows not only its own Gaussian but also those of other pixels and views.
-DETAIL = 2.0
-#: Largest such change of a colour.
-DETAIL_LIMIT = 0.1
-#: Matte above which a pixel is entirely covered by the subject.
-WHOLE = 0.99
 #: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
 Weights = tuple[float, float, float]
 WEIGHTS: Weights = (0.8, 0.2, 0.1)
@@ -128,33 +120,21 @@ class Descent:
 class Refinement:
     """Refine Gaussians towards the input images: ``refinement(gaussians, batch) -> Gaussians``.
 
-    Overlapping splats blur fine detail, and steps on a mean error hardly restore it, because its share
-    of the error is small. So the missing detail is finally added to the colours. Low frequencies are
-    left out: different exposures and wrong geometry would spoil them.
-
     Args:
         steps: number of optimiser steps, 1 or more.
         renderer: renders the input views, with gradients.
         changes: bounds by field: means in footprints of their pixels, scales as logarithms,
             opacities as logits, quaternions, colours. Other fields stay.
-        detail: factor of the missing fine detail that is added to colours, 0 or more.
 
     Raises:
         InputError: ``steps`` is below 1.
     """
 
-    def __init__(
-        self,
-        steps: int,
-        renderer: Renderer,
-        changes: Mapping[str, Change] = NEAR,
-        detail: float = DETAIL,
-    ):
+    def __init__(self, steps: int, renderer: Renderer, changes: Mapping[str, Change] = NEAR):
         require(steps >= 1, "refine", "1 or more steps", steps)
         self.steps = steps
         self.renderer = renderer
         self.changes = changes
-        self.detail = detail
 
     def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
         """Refine Gaussians predicted from ``batch``; returns them in the same order, without a gradient.
@@ -162,13 +142,11 @@ class Refinement:
         Raises:
             InputError: the Gaussians do not belong to pixels of ``batch``.
         """
-        if self.detail:
-            require(gaussians.pixel is not None, "refine", "Gaussians of the inputs' pixels", "others")
         seen = seen_by(batch)
         search = Descent(gaussians, batch, self.changes)
         for _ in range(self.steps):
             search.step(self.renderer, seen)
-        return self._detailed(search.gaussians, batch) if self.detail else search.gaussians
+        return search.gaussians
 
     def report(
         self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]
@@ -193,21 +171,6 @@ class Refinement:
             both = predicted, self(predicted, others)
             held_out = tuple(self._psnr(splats, batch.of_views([hidden])) for splats in both)
         return Report(self.steps, inputs, held_out)
-
-    @torch.no_grad()
-    def _detailed(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
-        """Add to each colour the missing detail of its pixel: the error minus its mean over 3 x 3
-        pixels, at pixels 2 or more inside the outline."""
-        photographs, silhouettes, cameras = seen_by(batch)
-        with exact(gaussians.means.device.type):
-            drawn = self.renderer(gaussians, cameras, background=0.0).image
-            missing = (photographs - drawn).flatten(0, 1)
-            fine = missing - F.avg_pool2d(missing, 3, 1, 1, count_include_pad=False)
-        is_inside = -F.max_pool2d(-silhouettes.flatten(0, 1), 5, 1, 2) > WHOLE
-        places = gaussians.image * batch.masks[0, 0].numel() + gaussians.pixel
-        own = (fine * is_inside).movedim(1, -1).flatten(0, 2)[places]
-        change = (self.detail * own).clamp(-DETAIL_LIMIT, DETAIL_LIMIT)
-        return replace(gaussians, colors=gaussians.colors + change)
 
     @torch.no_grad()
     def _psnr(self, gaussians: Gaussians, batch: Batch) -> float:

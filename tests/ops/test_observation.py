@@ -10,8 +10,7 @@ from ghgs_lit.method.rounds.observation import observe
 from ghgs_lit.rendering import render
 from ghgs_lit.types import map_tensors
 from tests.helpers.kernels import WHERE, kernels
-from tests.helpers.scenes import make_batch, with_soft_rims
-from tests.method.rounds.test_observation import splats
+from tests.helpers.scenes import make_batch, surface_splats, with_soft_rims
 
 EPS = torch.finfo(torch.float32).eps
 
@@ -34,7 +33,7 @@ def test_values_are_as_exact_as_plain_pytorchs(kind, b, v, height, width, spread
     batch = make_batch(b, v, height, width)
     batch = with_soft_rims(batch) if is_soft else batch
     batch.masks[-1, 0] = False
-    gaussians = splats(make_batch(b, v, height, width))
+    gaussians = surface_splats(make_batch(b, v, height, width))
     noise = torch.randn(gaussians.means.shape, generator=torch.Generator().manual_seed(1))
     gaussians = dataclasses.replace(gaussians, means=gaussians.means + spread * noise)
     if b > 1:
@@ -64,7 +63,7 @@ def test_values_are_as_exact_as_plain_pytorchs(kind, b, v, height, width, spread
 @pytest.mark.parametrize("kind", WHERE)
 def test_nothing_in_a_batch_of_none_and_what_is_not_finite_stays_where_it_is(kind):
     batch = make_batch(2, 3, 28, 28)
-    gaussians = splats(batch)
+    gaussians = surface_splats(batch)
     rendering = render(gaussians, batch.cameras)
     gaussians, batch, rendering = on_device(kind, gaussians, batch, rendering)
     means, images = gaussians.means.clone(), batch.images.clone()

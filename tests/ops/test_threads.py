@@ -11,9 +11,8 @@ from ghgs_lit.ops.attention import cpu as attention
 from ghgs_lit.ops.attention.cpu import QUERIES
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.ops.round_memory import remembered
-from tests.helpers.scenes import make_batch
+from tests.helpers.scenes import make_batch, surface_splats
 from tests.method.heads.test_gaussian import make_head
-from tests.method.rounds.test_observation import splats
 from tests.ops import test_activation, test_attention, test_round_memory
 
 
@@ -33,7 +32,7 @@ def marched():
 
 def observed():
     batch = make_batch(2, 4, 112, 112)
-    return [observe(splats(batch), batch)]
+    return [observe(surface_splats(batch), batch)]
 
 
 def remembered_and_learned():

@@ -4,15 +4,14 @@ import dataclasses
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.geometry.projection import world_to_camera
-from ghgs_lit.metrics.functional import psnr, sharpness
+from ghgs_lit.metrics.functional import psnr
 from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.refinement import Refinement
-from ghgs_lit.refinement.refinement import DETAIL_LIMIT, _footprints
+from ghgs_lit.refinement.refinement import _footprints
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import painted_ellipsoid, ring
@@ -70,38 +69,9 @@ def test_changes_are_bounded():
     moved = (refined.means - splats.means).abs() / footprint
     assert 0.5 < moved.max() <= 1.001
     assert 0.5 < (refined.scales / splats.scales).log().abs().max() <= 1.001
-    assert 0.1 < (refined.colors - splats.colors).abs().max() <= 0.1501
+    assert 0.03 < (refined.colors - splats.colors).abs().max() <= 0.0501
     assert ((refined.opacities > 0) & (refined.opacities < 1)).all()
     assert torch.equal(refined.quaternions, splats.quaternions)
-
-
-def test_fine_detail_comes_back_and_nothing_else():
-    """Overlapping splats blur a texture; different exposures and the background must not change colours."""
-    splats, inputs, _ = scene(views=2, size=112)
-    checks = (torch.arange(112)[:, None] + torch.arange(112)) % 2 * 0.3 + 0.4
-    textured = dataclasses.replace(inputs, images=checks * inputs.masks[:, :, None].expand_as(inputs.images))
-    colors = textured.images.movedim(2, -1)[inputs.masks]
-    wide = dataclasses.replace(splats, colors=colors, scales=2 * splats.scales)
-    plain = Refinement(1, RENDERER, detail=0)(wide, textured)
-    refined = Refinement(1, RENDERER)(wide, textured)
-    for name in ("means", "scales", "quaternions", "opacities"):
-        assert torch.equal(getattr(refined, name), getattr(plain, name))
-    images, masks = textured.images[0], textured.masks[0]
-    before, after = (
-        sharpness(RENDERER(gaussians, inputs.cameras).image[0], images, masks).mean()
-        for gaussians in (plain, refined)
-    )
-    assert after > 1.15 * before
-    outside = (~inputs.masks[0]).float()
-    near = F.max_pool2d(outside, 5, 1, 2).flatten()[splats.image * 112**2 + splats.pixel] > 0
-    changed = (refined.colors != plain.colors).any(1)
-    assert changed[~near].all()
-    assert near.any()
-    assert not changed[near].any()
-    assert (refined.colors - plain.colors).abs().max() <= DETAIL_LIMIT + 1e-6
-    brighter = dataclasses.replace(textured, images=(0.1 + textured.images) * inputs.masks[:, :, None])
-    others = Refinement(1, RENDERER)._detailed(plain, brighter)
-    torch.testing.assert_close(others.colors, refined.colors, rtol=0, atol=1e-5)
 
 
 def test_the_input_that_is_held_out_takes_no_part():
