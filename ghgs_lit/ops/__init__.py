@@ -1,1 +1,1 @@
-"""Operators: each in plain PyTorch, with compiled kernels beside it where these win."""
+"""Operators, each in plain PyTorch, with compiled kernels where these are faster."""

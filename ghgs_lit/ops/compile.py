@@ -1,4 +1,4 @@
-"""Compilation of kernels with Numba; machine code stays on disk until the sources change."""
+"""Compilation of kernels with Numba; machine code is cached on disk until the sources change."""
 
 import contextlib
 import hashlib
@@ -15,14 +15,14 @@ from numba.core.caching import FunctionCache
 # Kernels are only called from Python and helpers only from kernels:
 # no other entry points are needed.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-#: Arguments of kernels: contiguous arrays of float32 by their number of dimensions,
-#: and whole numbers.
+#: Numba types of kernel arguments: contiguous float32 arrays, indexed by number of dimensions, and
+#: integers.
 FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
 NUMBER = types.int64
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of one function; unreadable files and those of other sources are replaced."""
+    """Numba's cache of one function; replaces files that are unreadable or built from other sources."""
 
     def __init__(self, py_func):
         super().__init__(py_func)
@@ -42,7 +42,7 @@ class _Cache(FunctionCache):
 
 
 class FirstCompilation(event.Listener):
-    """Prints one line at the first compilation of a process, but not in its workers."""
+    """Prints one line at the first compilation of the main process; worker processes print nothing."""
 
     is_said = multiprocessing.parent_process() is not None
 
@@ -52,7 +52,7 @@ class FirstCompilation(event.Listener):
         self.is_said = True
 
     def on_end(self, event):
-        """Does nothing; a listener must have this method."""
+        """Do nothing: Numba requires the method."""
 
 
 event.register("numba:compile", FirstCompilation())
@@ -60,8 +60,8 @@ event.register("numba:compile", FirstCompilation())
 
 @cache
 def _digest(folder: Path) -> str:
-    """Digest of the sources that the machine code of a kernel in ``folder`` depends on: those of
-    this package, of ``folder`` and of its parent. Kernels read no constants of other files."""
+    """Digest of the sources that a kernel in ``folder`` depends on: those of this package, of ``folder``
+    and of its parent, since kernels use no constants of other files."""
     digest = hashlib.sha256()
     rooms = (Path(__file__).parent, folder, folder.parent)
     for path in sorted(set().union(*(room.glob("*.py") for room in rooms))):
@@ -70,18 +70,18 @@ def _digest(folder: Path) -> str:
 
 
 def kernel(function):
-    """Compile ``function`` on first use; it runs without the interpreter lock.
+    """Compile ``function`` on first use, to run without the interpreter lock.
 
-    Numba's cache notices a changed file, but not changed globals or other modules whose code was
-    inlined, and installers may keep a file's time stamp. So cached code is stamped with the digest
-    of all sources that it can depend on. Without a writable folder for the cache, each process
+    Numba's cache detects a changed file, but not changed globals or changes in modules whose code was
+    inlined, and installers may keep a file's time stamp. Cached code is therefore stamped with the
+    digest of all sources that it can depend on. Without a writable cache folder, each process
     compiles again.
 
     Args:
         function: called from Python only, with numbers and contiguous arrays.
 
     Returns:
-        Numba's dispatcher, called like ``function``.
+        Numba's dispatcher, with the signature of ``function``.
     """
     compiled = numba.njit(**_OPTIONS)(function)
     with contextlib.suppress(RuntimeError):  # no folder for the cache
@@ -90,16 +90,16 @@ def kernel(function):
 
 
 def kernel_for(*argument_types):
-    """Decorator for a kernel with one signature, compiled at the first call.
+    """Decorate a kernel that has one signature and is compiled at the first call.
 
-    Other signatures are refused: other array layouts would cause another compilation for no gain.
+    The kernel rejects other signatures: another array layout would only cause another compilation.
 
     Args:
         argument_types: Numba types of the arguments, such as ``FLOATS[2]`` and :data:`NUMBER`.
 
     Returns:
-        A decorator that replaces a function by one without arguments,
-        which returns its :func:`kernel`.
+        A decorator that replaces a function by a function without arguments that returns the compiled
+        :func:`kernel`.
     """
 
     def decorate(function):
@@ -116,16 +116,16 @@ def kernel_for(*argument_types):
 
 
 def helper(function):
-    """Decorator for a function that is inlined into kernels and only called there."""
+    """Decorate a function that is only called in kernels, into which it is inlined."""
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
 def processor_features() -> set[str]:
-    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``.
+    """LLVM names of the processor features that kernels may use, such as ``avx512bf16``.
 
-    Features of this processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``:
-    ``-avx512f`` gives the kernels for AVX2. If ``NUMBA_CPU_NAME`` is set, too, only the
-    features in that setting.
+    These are the features of this processor with the changes of ``NUMBA_CPU_FEATURES``: ``-avx512f``
+    selects the kernels for AVX2. If ``NUMBA_CPU_NAME`` is set as well, they are only the features
+    listed in ``NUMBA_CPU_FEATURES``.
     """
     changes = numba.config.CPU_FEATURES
     is_own = numba.config.CPU_NAME is None or changes is None

@@ -1,7 +1,7 @@
-"""Operators of PyTorch with kernels: in Numba for a CPU, in Triton for a GPU.
+"""PyTorch operators with kernels in Numba for CPUs and in Triton for GPUs.
 
-An operator lies in a package of :mod:`ghgs_lit.ops`: its plain form in ``__init__``, its kernels in
-``cpu`` and ``cuda``, which are imported at their first call. Callers see one function."""
+Each operator is a package of :mod:`ghgs_lit.ops`: its plain PyTorch version is in ``__init__``, its
+kernels are in ``cpu`` and ``cuda``, which are imported at the first call. Callers use one function."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,26 +15,28 @@ from torch.library import Library
 
 LIBRARY = Library("ghgs_lit", "DEF")
 
-#: Types of devices whose kernels are in Triton.
+#: Device types whose kernels are written in Triton.
 DEVICES = {"cuda"}
 
-#: All operators by their names.
+#: All operators by name.
 OPERATORS: dict[str, "Operator"] = {}
 
 
 class Operator:
-    """``torch.ops.ghgs_lit.<name>`` where a kernel can compute it, else its plain form.
+    """Call ``torch.ops.ghgs_lit.<name>`` where a kernel supports the inputs, else the plain version.
 
-    Being one operator, a kernel is one call in profiles. What needs a gradient that no kernel
-    computes takes the plain form, which autograd differentiates.
+    A kernel appears as one operator in profiles. Inputs that need a gradient which no kernel computes
+    go to the plain version, which autograd differentiates.
 
     Args:
-        schema: name, arguments and results in PyTorch's notation.
-        plain: the same in plain PyTorch.
-        package: its modules ``cpu`` and ``cuda`` have functions of this name that start kernels.
-        fits: for each of these devices whether the kernel computes with some inputs.
-        learned: for each device, places of the inputs whose gradients are computed by kernels, or 0.
-        dtypes: floating-point types of the inputs.
+        schema: name, arguments and results in PyTorch's schema notation.
+        plain: the operator in plain PyTorch.
+        package: package whose modules ``cpu`` and ``cuda`` define a function of the operator's name,
+            which launches the kernel.
+        fits: for each device type, a function of the inputs: whether the kernel supports them.
+        learned: for each device type, the positions of inputs whose gradient the kernels compute or
+            is 0.
+        dtypes: supported floating-point dtypes of the inputs.
     """
 
     def __init__(
@@ -60,11 +62,11 @@ class Operator:
         OPERATORS[self.name] = self
 
     def __call__(self, *inputs: Any) -> Any:
-        """The results; see the plain form."""
+        """Compute the results; see the plain version."""
         return (self.packet.default if self.has_kernel(*inputs) else self.plain)(*inputs)
 
     def has_kernel(self, *inputs: Any) -> bool:
-        """Whether a kernel computes with these."""
+        """Whether a kernel supports these inputs."""
         given = dict(_tensors(inputs))
         kinds = {_kind(tensor) for tensor in given.values()}
         kind = kinds.pop()
@@ -85,17 +87,17 @@ class Operator:
 
 
 def everything(*inputs: Any) -> bool:
-    """True: a kernel computes with all inputs."""
+    """Always true: the kernel supports all inputs."""
     return True
 
 
 def without_gradients(*inputs: Any) -> bool:
-    """Whether autograd is off."""
+    """Whether autograd is disabled."""
     return not torch.is_grad_enabled()
 
 
 def _tensors(inputs: Sequence[Any]) -> Iterator[tuple[tuple[int, int], Tensor]]:
-    """Tensors by the place of their input, and by their place in a list."""
+    """Pairs of ((position of the input, position in its list), tensor)."""
     for n, value in enumerate(inputs):
         each = value if isinstance(value, list | tuple) else (value,)
         for k, tensor in enumerate(each):
@@ -104,7 +106,7 @@ def _tensors(inputs: Sequence[Any]) -> Iterator[tuple[tuple[int, int], Tensor]]:
 
 
 def _kind(tensor: Tensor) -> str:
-    """The module with the kernels of a tensor's device; FakeTensors have none."""
+    """Name of the module with the kernels for a tensor's device; empty for FakeTensors."""
     kind = tensor.device.type
     if kind in DEVICES:
         return "cuda" if kind != "cuda" or _triton_works() else ""
@@ -113,7 +115,7 @@ def _kind(tensor: Tensor) -> str:
 
 @cache
 def _triton_works() -> bool:
-    """Whether Triton can start kernels. It needs a C compiler once, which not every machine has."""
+    """Whether Triton can launch kernels: its first launch needs a C compiler."""
     try:
         from triton.runtime import driver  # here: it comes with PyTorch for CUDA only
 

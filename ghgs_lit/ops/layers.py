@@ -1,15 +1,15 @@
-"""Small networks inside kernels, ``PANEL`` rows at a time, and their gradients.
+"""Small MLPs inside Numba kernels, ``PANEL`` rows at a time, and their gradients.
 
-Matrix products stay in registers: a tile of the result is ``ROWS`` x ``PANEL``; its right factor is
-a panel, ``PANEL`` numbers for every step of the sum.
+Matrix products accumulate in registers: a tile of the result is ``ROWS`` x ``PANEL``; the right factor
+is a panel, ``PANEL`` numbers for each step of the sum.
 
-Values are stored by channel: a channel is a line of ``PANEL`` floats, one lane for each row. So the
-result of a layer is the input of the next without another layout. The gradient of a layer's input
-is a product with the transposed weights; that of its weights and biases is a sum over lanes, for
-which the input has a line of ones below its channels.
+Values are stored channel by channel: a channel is a line of ``PANEL`` floats, one lane per row. The
+output of a layer therefore has the layout of the next layer's input. The gradient of a layer's input
+is a product with the transposed weights; the gradient of its weights and biases is a sum over lanes,
+for which a line of ones follows the channels of the input.
 
-``emit(context, builder, sig, args)`` writes the LLVM instructions of a function with
-``@intrinsic``, which kernels call without its first parameter, Numba's ``typing_context``.
+``emit(context, builder, sig, args)`` writes the LLVM instructions of a function decorated with
+``@intrinsic``; kernels call it without its first parameter, Numba's ``typing_context``.
 """
 
 from collections.abc import Sequence
@@ -26,21 +26,21 @@ from ghgs_lit.ops.compile import helper, processor_features
 from ghgs_lit.ops.memory import pointer_to
 from ghgs_lit.ops.simd import I64, LANES, call, constant, everywhere, floats
 
-#: Rows and columns of a tile: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They
-#: divide ``QUERIES`` and ``WIDTH`` of ``ops.attention``.
+#: Rows and columns of a tile, which takes 24 of the 32 registers of AVX-512 or 12 of the 16 of AVX2.
+#: They divide ``QUERIES`` and ``WIDTH`` of ``ops.attention``.
 ROWS, PANEL = (12, 32) if "avx512f" in processor_features() else (6, 16)
 
 
 def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:
-    """Add the products of each row and the panel over ``steps`` numbers to ``totals``.
+    """Emit the loop that adds the products of each row and the panel to ``totals``.
 
     Args:
-        builder: of LLVM instructions.
+        builder: LLVM IR builder.
         rows: pointer to the first number of the first row.
-        row_stride: numbers from row to row.
-        step_stride: numbers from step to step.
+        row_stride: distance of rows, in numbers.
+        step_stride: distance of steps, in numbers.
         panel: pointer to the panel, ``PANEL`` floats for each step.
-        steps: numbers of the sum, an LLVM integer.
+        steps: length of the sum, an LLVM integer.
         totals: pointers to the sums, [ROWS][PANEL / LANES] vectors.
     """
     with cgutils.for_range(builder, steps, intp=I64) as loop:
@@ -58,32 +58,31 @@ def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, total
 
 
 def make_product(strides: tuple[int, int], adds: bool):
-    """A function that multiplies ``ROWS`` rows with a panel.
+    """Make an intrinsic that multiplies ``ROWS`` rows with a panel.
 
     Args:
-        strides: distances in numbers from row to row and from step to step, constants for the
-            compiler, which keep all registers free for the tile.
+        strides: distances of rows and of steps, in numbers; compile-time constants, so that all
+            registers are free for the tile.
         adds: add the product to ``out`` instead of overwriting it.
 
     Returns:
-        An intrinsic of Numba:
-        ``product(x, x_at, panels, panel_at, steps, out, out_at, out_stride)``.
+        A Numba intrinsic ``product(x, x_at, panels, panel_at, steps, out, out_at, out_stride)``.
     """
 
     @intrinsic
     def product(typing_context, x, x_at, panels, panel_at, steps, out, out_at, out_stride):
-        """Multiply ``ROWS`` rows of ``x`` with a panel, to ``ROWS`` x ``PANEL`` numbers of ``out``.
+        """Multiply ``ROWS`` rows of ``x`` with a panel, giving a ``ROWS`` x ``PANEL`` tile of ``out``.
 
         Args:
             typing_context: Numba's.
             x: flat float32.
             x_at: index of the first number of the first row.
-            panels: flat float32, from a cache line on.
+            panels: flat float32, aligned to a cache line.
             panel_at: index of the panel, a multiple of 16.
-            steps: numbers of the sum.
-            out: flat float32, from a cache line on.
+            steps: length of the sum.
+            out: flat float32, aligned to a cache line.
             out_at: index of the first number of the tile, a multiple of 16.
-            out_stride: numbers from row to row of ``out``, a multiple of 16.
+            out_stride: distance of rows of ``out`` in numbers, a multiple of 16.
         """
 
         def emit(context, builder, sig, args):
@@ -93,7 +92,7 @@ def make_product(strides: tuple[int, int], adds: bool):
                 )
 
             count = PANEL // LANES
-            # These become registers, since their addresses stay in this function.
+            # LLVM promotes these to registers, since their addresses do not leave this function.
             totals = []
             for _ in range(ROWS):
                 totals.append([cgutils.alloca_once(builder, floats.llvm) for _ in range(count)])
@@ -119,20 +118,19 @@ def make_product(strides: tuple[int, int], adds: bool):
     return product
 
 
-#: ``out = x y`` where the numbers of all rows for one step are contiguous.
+#: ``out = x y``, where the numbers of all rows for one step are contiguous.
 product = make_product((1, ROWS), adds=False)
 
 
 ZERO = np.float32(0)
 ONE = np.float32(1)
 
-#: ``out += x y^T``, summed over the lanes of the lines ``x`` and of ``y`` as
-#: :func:`_turn` stores it.
+#: ``out += x y^T``, summed over lanes; ``x`` is lines, ``y`` has the layout of :func:`_turn`.
 _lane_product = make_product((PANEL, 1), adds=True)
 
 
 def room(channels: int) -> int:
-    """Lines that a layer with ``channels`` outputs writes: whole tiles."""
+    """Number of lines written by a layer with ``channels`` outputs, rounded up to whole tiles."""
     return -(-channels // ROWS) * ROWS
 
 
@@ -140,7 +138,7 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
     """Weight and bias of each linear layer, in the order that :func:`packed` expects.
 
     Args:
-        layers: such as those of an ``nn.Sequential``; others than linear ones are left out.
+        layers: such as the modules of an ``nn.Sequential``; all but ``nn.Linear`` are skipped.
     """
     numbers = []
     for layer in layers:
@@ -150,14 +148,14 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
 
 
 def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
-    """Layers packed into one flat array.
+    """Pack layers into one flat array.
 
     Args:
         numbers: weight [outputs, inputs] and bias [outputs] of each layer.
         transposed: pack transposed weights, with biases of 0.
 
     Returns:
-        For each layer the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the
+        For each layer, the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the
         biases; float32.
     """
     parts = []
@@ -173,21 +171,21 @@ def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
 
 
 def _pairs(numbers: Sequence) -> list[tuple]:
-    """Weight and bias of each layer."""
+    """Pairs of weight and bias of each layer."""
     return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 class Sums:
-    """Sums of the gradients of layers for each task of a kernel.
+    """Gradients of layers, accumulated separately by each task of a kernel.
 
     Args:
         numbers: weight [outputs, inputs] and bias [outputs] of each layer.
-        tasks: number of tasks that run at once.
+        tasks: number of concurrent tasks.
 
     Attributes:
-        places: where packed weights, transposed weights and sums of each layer begin,
+        places: offsets of the packed weights, the transposed weights and the sums of each layer,
             [layers + 1, 3].
-        of_task: sums of each task, from :func:`learn`, [tasks, numbers].
+        of_task: sums of each task, written by :func:`learn`, [tasks, numbers].
     """
 
     def __init__(self, numbers: Sequence[Tensor], tasks: int):
@@ -200,7 +198,7 @@ class Sums:
         self.of_task[:] = 0
 
     def gradients(self) -> list[Tensor]:
-        """Gradients of weight and bias of each layer."""
+        """Gradients of the weight and bias of each layer, summed over tasks."""
         sums = np.split(self.of_task.sum(0), self.places[1:-1, 2])
         both = [
             part.reshape(block).swapaxes(1, 2).reshape(-1, block[1])[: shape[0], : shape[1] + 1]
@@ -218,24 +216,19 @@ lines = helper(room)
 
 @helper
 def size(outputs, inputs):
-    """Floats of a packed layer.
-
-    Args:
-        outputs: channels of its result.
-        inputs: channels of its input.
-    """
+    """Number of floats of a packed layer with these channels of output and input."""
     return lines(outputs) * (inputs + 1)
 
 
 @helper
 def put_rows(table, first, count, line, values):
-    """Copy rows of a table to lines; the last row is repeated in the other lanes.
+    """Copy rows of a table to lines; the last row fills the remaining lanes.
 
     Args:
         table: float32 [rows, channels].
         first: first row.
         count: number of rows, 1 to ``PANEL``.
-        line: first line that is written.
+        line: first line to write.
         values: lines of ``PANEL`` floats, flat.
     """
     for lane in range(PANEL):
@@ -246,15 +239,15 @@ def put_rows(table, first, count, line, values):
 
 @helper
 def linear(layers, at, outputs, inputs, values, result):
-    """``result = W values`` of a packed layer, without its biases.
+    """Compute ``result = W values`` of a packed layer, without its biases.
 
     Args:
         layers: packed layers, from :func:`packed`.
-        at: where the layer begins.
+        at: offset of the layer.
         outputs: channels of the result.
         inputs: channels of ``values``.
         values: lines of ``PANEL`` floats, flat.
-        result: gets ``room(outputs)`` lines.
+        result: written, ``room(outputs)`` lines.
     """
     for row in range(0, outputs, ROWS):
         product(layers, at + row * inputs, values, 0, inputs, result, row * PANEL, PANEL)
@@ -262,11 +255,11 @@ def linear(layers, at, outputs, inputs, values, result):
 
 @helper
 def rectify(layers, at, outputs, inputs, values):
-    """``values = max(values + b, 0)`` with the biases of a packed layer; NaN stays.
+    """Compute ``values = max(values + b, 0)`` with the biases of a packed layer; NaN stays NaN.
 
     Args:
         layers: packed layers, from :func:`packed`.
-        at: where the layer begins.
+        at: offset of the layer.
         outputs: channels of ``values``.
         inputs: channels of the layer's input.
         values: lines of ``PANEL`` floats, flat; changed in place.
@@ -279,12 +272,7 @@ def rectify(layers, at, outputs, inputs, values):
 
 @helper
 def put_ones(line, values):
-    """Fill a line with ones, the input of biases.
-
-    Args:
-        line: the line, counted from the first one.
-        values: lines of ``PANEL`` floats, flat.
-    """
+    """Fill the line with index ``line`` with ones, the input of biases."""
     for i in range(line * PANEL, (line + 1) * PANEL, LANES):
         memory.store(values, i, simd.full(ONE))
 
@@ -297,7 +285,7 @@ def put_slopes(table, first, count, values):
         table: float32 [rows, channels].
         first: first row.
         count: number of rows, at most ``PANEL``.
-        values: gets a line of ``PANEL`` floats for each channel.
+        values: written, a line of ``PANEL`` floats for each channel.
     """
     for lane in range(PANEL):
         for channel in range(table.shape[1]):
@@ -307,12 +295,12 @@ def put_slopes(table, first, count, values):
 
 @helper
 def unrectify(values, channels, slopes):
-    """Gradients before a ReLU, in place of those after it.
+    """Replace the gradient of a ReLU's output by the gradient of its input.
 
     Args:
-        values: results of the ReLU, lines of ``PANEL`` floats.
+        values: outputs of the ReLU, lines of ``PANEL`` floats.
         channels: number of lines.
-        slopes: gradients of the results; changed in place.
+        slopes: gradients, changed in place.
     """
     for i in range(0, channels * PANEL, LANES):
         is_off = memory.load(values, i) <= ZERO
@@ -321,13 +309,7 @@ def unrectify(values, channels, slopes):
 
 @helper
 def _turn(slopes, channels, turned):
-    """Write lines as panels of ``PANEL`` channels, with a row for each lane.
-
-    Args:
-        slopes: lines of ``PANEL`` floats.
-        channels: number of lines.
-        turned: gets whole panels.
-    """
+    """Transpose lines to panels of ``PANEL`` channels, one row per lane; writes whole panels."""
     for channel in range(channels):
         at = channel // PANEL * PANEL * PANEL + channel % PANEL
         for lane in range(PANEL):
@@ -343,9 +325,9 @@ def learn(values, inputs, slopes, outputs, turned, at, sums):
         inputs: channels of the layer's input.
         slopes: gradients of the layer's outputs, lines of ``PANEL`` floats.
         outputs: channels of the layer's output.
-        turned: room for whole panels of ``slopes``.
-        at: where the layer's sums begin.
-        sums: of one task, as in :class:`Sums`.
+        turned: buffer for ``slopes`` as whole panels.
+        at: offset of the layer's sums.
+        sums: sums of one task; see :class:`Sums`.
     """
     _turn(slopes, outputs, turned)
     rows = lines(inputs + 1)

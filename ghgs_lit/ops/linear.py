@@ -1,7 +1,8 @@
-"""Matrix products by the faster of the two libraries that PyTorch uses on a CPU. ``nn.Linear`` in
-float32 calls MKL, which uses only half the vector width of AVX-512 on CPUs by other makers than
-Intel: 95 to 117 GFLOP/s per core, against 186 to 254 with oneDNN. Without AVX-512 both are equally
-fast. Other devices, other precisions and tiny products are not affected."""
+"""Linear layers on a CPU with the faster of MKL and oneDNN.
+
+``nn.Linear`` in float32 calls MKL, which uses only half the vector width of AVX-512 on CPUs that are
+not made by Intel: 95 to 117 GFLOP/s per core, against 186 to 254 with oneDNN. Without AVX-512 both are
+equally fast. Other devices, other precisions and small products are not affected."""
 
 import torch
 import torch.nn.functional as F
@@ -9,13 +10,13 @@ from torch import Tensor, nn
 
 from ghgs_lit.ops.pool import even_parts
 
-#: Multiplications from which oneDNN is faster in spite of its slower calls: without a gradient, and
-#: with one, as a convolution, which also needs more than ``_PIXELS`` inputs (PyTorch's own limit)
-#: and two threads.
+#: Multiplications from which oneDNN is faster despite its larger overhead per call: without a gradient
+#: (``_SMALL``), and with one (``_LARGE``), as a convolution, which also needs two threads and more than
+#: ``_PIXELS`` inputs (PyTorch's limit).
 _SMALL = 1 << 21
 _LARGE = 1 << 24
 _PIXELS = 20480
-#: Weight values that oneDNN copies at once if the input has fewer rows than channels.
+#: Number of weights per call of oneDNN if the input has fewer rows than channels.
 _COPY = 1 << 20
 
 
@@ -24,7 +25,7 @@ _WIDE_PRODUCTS = _WIDE_PRODUCTS and torch.backends.cpu.get_cpu_capability() == "
 
 
 def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Whether oneDNN computes :func:`linear` faster.
+    """Whether :func:`linear` is faster with oneDNN.
 
     Args:
         x: [..., inputs].
@@ -56,8 +57,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     product = _convolve if torch.is_grad_enabled() else _multiply
     if x.numel() >= k * k or weight.numel() <= _COPY:
         return product(x, weight, bias)
-    # oneDNN copies the weight to its own layout;
-    # with few rows that copy would take most of the memory.
+    # oneDNN copies the weight to its own layout, which would take most of the memory if rows are few.
     parts = even_parts(len(weight), _COPY // k)
     return torch.cat([product(x, weight[p], None if bias is None else bias[p]) for p in parts], dim=-1)
 
@@ -67,8 +67,7 @@ def _multiply(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """The product as a convolution, with rows as pixels and channels innermost,
-    so that nothing is copied."""
+    """The product as a convolution, with rows as pixels and channels innermost to avoid copies."""
     pixels = x.reshape(1, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)
     products = F.conv2d(pixels, weight[:, :, None, None], bias)
     return products.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))

@@ -1,6 +1,6 @@
-"""Loads and stores of whole vectors.
+"""Vector loads and stores inside Numba kernels.
 
-Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
+Kernels call functions decorated with ``@intrinsic`` without their first parameter, Numba's
 ``typing_context``; ``emit(context, builder, sig, args)`` writes their LLVM instructions.
 """
 
@@ -15,10 +15,10 @@ def pointer_to(context, builder, array_type, array, index, index_type, kind):
     """Pointer to a vector at an element of a contiguous array.
 
     Args:
-        context: Numba's, of the target.
-        builder: of LLVM instructions.
+        context: Numba's target context.
+        builder: LLVM IR builder.
         array_type: Numba type of the array.
-        array: its LLVM value.
+        array: LLVM value of the array.
         index: flat index of the element, an LLVM integer.
         index_type: Numba type of ``index``.
         kind: LLVM type of the vector.
@@ -29,15 +29,11 @@ def pointer_to(context, builder, array_type, array, index, index_type, kind):
 
 
 def _make_access(alignment_of):
-    """Intrinsics that load and store vectors.
-
-    Args:
-        alignment_of: from a kind of vector to the bytes to which addresses are aligned.
-    """
+    """Make intrinsics that load and store vectors; ``alignment_of`` maps a vector type to bytes."""
 
     @intrinsic
     def load(typing_context, array, index):
-        """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
+        """Load the vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
         kind = vector_of(array.dtype)
 
         def emit(context, builder, sig, args):
@@ -53,8 +49,8 @@ def _make_access(alignment_of):
         Args:
             typing_context: Numba's.
             array: contiguous, one-dimensional, float32 or float64.
-            index: of the first element.
-            value: a vector, or a number for all its lanes.
+            index: index of the first element.
+            value: a vector, or a number for all lanes.
         """
         kind = vector_of(array.dtype)
 
@@ -68,8 +64,8 @@ def _make_access(alignment_of):
     return load, store
 
 
-# ``load`` and ``store`` need vectors of floats to start on a cache line;
-# the others take any address.
+# ``load`` and ``store`` require that vectors of floats start on a cache line; ``store_anywhere``
+# accepts any address.
 load, store = _make_access(lambda kind: 64 if kind is floats else 8)
 _, store_anywhere = _make_access(lambda kind: 4 if kind is floats else 8)
 

@@ -1,5 +1,6 @@
-"""Exact nearest neighbours of tokens, and attention to them (paper, section 3.3), a part of the tokens
-at a time where that saves memory."""
+"""Exact nearest neighbours of tokens, and attention to them (paper, section 3.3).
+
+Large inputs are processed in parts, to save memory."""
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +13,7 @@ from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.ops.linear import linear
 from ghgs_lit.ops.pool import at_once, even_parts, in_parts
 
-#: Distances in memory at once: a block fits a CPU's cache; on a GPU they take 200 MB with their keys.
+#: Distances in memory at once: a block fits a CPU's cache; on a GPU, distances and keys take 200 MB.
 _BLOCK = 1 << 17
 _GPU_BLOCK = 1 << 23
 #: Cosines in memory at once.
@@ -32,19 +33,19 @@ def nearest_neighbors(
     places: Int[Tensor, "*b n"] | None = None,
     views: int = 0,
 ) -> Int[Tensor, "*b n k"]:
-    """The nearest points of each point in any view, itself included.
+    """Find the nearest points of each point in all views, the point itself included.
 
-    Of one element, or of several with the same number of points. Distances are computed from
+    Leading dimensions are elements with the same number of points. Distances are computed from
     differences in float32 or wider: products would lose digits far from the origin.
 
     Args:
         points: positions of the tokens, of any dimension d.
-        view: the view of each token; read with ``places``.
+        view: view of each token; used only with ``places``.
         k: number of neighbours, at least 1.
-        places: a number of each token's place, which orders points at equal distances: nearest
-            number first, so that opposite places alternate, and at each place the query's own view,
-            then the next views. None: ties by index.
-        views: number of views of an element; read with ``places``.
+        places: a number for the place of each token, which breaks ties of distance: the nearest number
+            first, so that opposite places alternate, and at each place the query's own view, then the
+            next views. None: ties are ordered by index.
+        views: number of views of an element; used only with ``places``.
 
     Returns:
         Indices [..., n, min(k, n)], nearest first.
@@ -67,8 +68,7 @@ def nearest_neighbors(
 
 
 def _smallest(distance: Tensor, ranks: Int[Tensor, "*#bm n"], k: int) -> Int[Tensor, "*b m k"]:
-    """Columns of the smallest values of each row, in the order of ``ranks`` where they are equal; NaN is
-    largest."""
+    """Columns of the k smallest values of each row; ``ranks`` orders equal values, and NaN is largest."""
     if distance.dtype == torch.float64:
         order = ranks.argsort(dim=-1).expand(distance.shape)
         return order.gather(-1, distance.gather(-1, order).sort(dim=-1, stable=True).indices[..., :k])
@@ -85,7 +85,7 @@ def neighbor_cosines(
 ) -> Float[Tensor, "*b n k"]:
     """Cosines of the semantic features of tokens and their neighbours (Eq. 4).
 
-    One element, or several with the same number of tokens.
+    Leading dimensions are elements with the same number of tokens.
 
     Args:
         semantic: features [..., n, s].
@@ -115,16 +115,16 @@ def attend_to_neighbors(
     factor: Float[Tensor, "m k"] | None = None,
     bias: Float[Tensor, "m k"] | None = None,
 ) -> Float[Tensor, "m j"]:
-    """Weighted values of the neighbours of ``m`` tokens, in float32 or wider.
+    """Multi-head attention of ``m`` tokens to their neighbours, in float32 or wider.
 
     Args:
-        q: queries of these tokens [m, i].
+        q: queries of the m tokens [m, i].
         k: keys of all n tokens [n, i].
-        v: their values [n, j].
+        v: values of all n tokens [n, j].
         near: neighbours of the m tokens [m, k].
         heads: number of heads, which divides i and j.
-        factor: what logits are multiplied by [m, k]; None: 1.
-        bias: what is added to them then [m, k]; None: 0.
+        factor: multiplies the logits [m, k]; None: 1.
+        bias: added to the logits after ``factor`` [m, k]; None: 0.
 
     Returns:
         Values [m, j], heads concatenated.
@@ -132,7 +132,7 @@ def attend_to_neighbors(
     with exact(q.device.type):
         if q.device.type != "cpu" or heads * len(q) * len(k) > _SCORES:
             return _attend_by_gathering(q, k, v, near, heads, factor, bias)
-        # A product with all tokens is faster than gathering, and no tensor has the size m x k x C.
+        # A product with all tokens is faster than gathering and needs no tensor of size m x k x C.
         q, k, v = (values.unflatten(1, (heads, -1)).transpose(0, 1) for values in (q, k, v))
         index = near[None].expand(heads, -1, -1)
         scores = q * q.shape[-1] ** -0.5 @ k.mT
@@ -146,8 +146,8 @@ def attend_to_neighbors(
 def _attend_by_gathering(
     q: Tensor, k: Tensor, v: Tensor, near: Tensor, heads: int, factor: Tensor | None, bias: Tensor | None
 ) -> Tensor:
-    """:func:`attend_to_neighbors` without a tensor as large as the square of the tokens. If there are
-    several parts, the backward pass computes each again."""
+    """:func:`attend_to_neighbors` without an m x n tensor; the backward pass recomputes each of several
+    parts."""
 
     def attend(rows: slice) -> Tensor:
         of_rows = (None if values is None else values[rows] for values in (factor, bias))
@@ -168,17 +168,17 @@ def neighbor_weights(
     factor: Float[Tensor, "m k"] | None = None,
     bias: Float[Tensor, "m k"] | None = None,
 ) -> Float[Tensor, "m k a"]:
-    """Softmax weights, in each head, of the neighbours of ``m`` tokens.
+    """Attention weights of the neighbours of ``m`` tokens, for each of ``a`` heads.
 
     Args:
         q: queries of the tokens [m, i].
-        keys: of their neighbours [m, k, i].
-        heads: number of heads.
-        factor: as of :func:`attend_to_neighbors`, as is the next.
-        bias: what is added to the logits.
+        keys: keys of their neighbours [m, k, i].
+        heads: number of heads, a.
+        factor: multiplies the logits [m, k]; None: 1.
+        bias: added to the logits after ``factor`` [m, k]; None: 0.
 
     Returns:
-        Weights [m, k, a].
+        Weights [m, k, a], which sum to 1 over k.
     """
     products = (q[:, None] * keys).unflatten(-1, (heads, -1)).sum(-1)
     factor, bias = (None if values is None else values[..., None] for values in (factor, bias))

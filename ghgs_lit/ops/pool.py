@@ -1,5 +1,4 @@
-"""Division of work into parts, and a thread pool for kernels,
-which run without the interpreter lock."""
+"""Division of work into parts, and a thread pool for kernels that run without the interpreter lock."""
 
 import os
 import threading
@@ -13,10 +12,10 @@ from torch import Tensor, nn
 
 
 def at_once(device: torch.device, cpu: int, gpu: int) -> int:
-    """The limit for ``device``: a CPU needs parts that fit its cache, a GPU few calls.
+    """Select the limit for ``device``: parts should fit the cache of a CPU, and be few on a GPU.
 
     Args:
-        device: where the work is done.
+        device: device of the computation.
         cpu: limit for a CPU.
         gpu: limit for any other device.
     """
@@ -24,26 +23,26 @@ def at_once(device: torch.device, cpu: int, gpu: int) -> int:
 
 
 def even_parts(count: int, most: int) -> list[slice]:
-    """Slices of equal size: a small last part would be slow.
+    """Divide ``range(count)`` into slices of nearly equal size, since a small last part would be slow.
 
     Args:
         count: number of rows.
-        most: of rows in a slice.
+        most: largest number of rows in a slice; less than 1 counts as 1.
 
     Returns:
-        Slices that cover ``range(count)``; an empty one if ``count`` is 0.
+        Slices that cover ``range(count)``; one empty slice if ``count`` is 0.
     """
     parts = max(1, -(-count // max(1, most)))
     return [slice(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
 
 
 def in_parts(function: Callable[[slice], Tensor], count: int, most: int) -> Tensor:
-    """A function of all rows, computed for a part of them at a time.
+    """Compute a function of rows, one part of the rows at a time.
 
     Args:
-        function: rows to values [..., m, c].
-        count: number of all rows.
-        most: of rows in a part; with a gradient all.
+        function: maps a slice of rows to values [..., m, c].
+        count: number of rows.
+        most: largest number of rows in a part; with a gradient, all rows.
 
     Returns:
         Values [..., count, c].
@@ -54,7 +53,7 @@ def in_parts(function: Callable[[slice], Tensor], count: int, most: int) -> Tens
     result = None
     for rows in parts:
         part = function(rows)
-        if result is None:  # filled, since small results between freed parts would fragment the memory
+        if result is None:  # filled in place: small results between freed parts fragment the memory
             result = part.new_empty(*part.shape[:-2], count, part.shape[-1])
         result[..., rows, :] = part
     return result
@@ -69,8 +68,7 @@ _owner: tuple[int, int] | None = None
 
 
 def _reset_lock() -> None:
-    """Replace the lock: a forked child may inherit it held by a thread that exists only in
-    its parent."""
+    """Replace the lock, which a forked child may inherit while held by a thread of its parent."""
     global _lock
     _lock = threading.Lock()
 
@@ -80,7 +78,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _workers(count: int) -> ThreadPoolExecutor:
-    """The pool of this process; a new one after a fork or a change of the number of threads."""
+    """The thread pool of this process, created anew after a fork or a change of the number of threads."""
     global _pool, _owner
     with _lock:
         if _owner != (os.getpid(), count):
@@ -90,21 +88,20 @@ def _workers(count: int) -> ThreadPoolExecutor:
 
 
 def have_values(*tensors: Tensor) -> bool:
-    """Whether NumPy can read these, unlike PyTorch's FakeTensors."""
+    """Whether all tensors have data that NumPy can read, unlike PyTorch's FakeTensors."""
     return all(type(x) in (Tensor, nn.Parameter) for x in tensors)
 
 
 @cache
 def features() -> set[str]:
-    """Processor features that kernels may use;
-    see :func:`ghgs_lit.ops.compile.processor_features`."""
+    """Cached :func:`ghgs_lit.ops.compile.processor_features`."""
     from ghgs_lit.ops.compile import processor_features  # here: it loads a compiler
 
     return processor_features()
 
 
 def multiplies(*tensors: Tensor) -> bool:
-    """Whether kernels compute products of these faster than PyTorch: float32 on a CPU with AVX2."""
+    """Whether kernels multiply these faster than PyTorch: float32 on a CPU with AVX2, no autocast."""
     supported = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
     return (
         supported
@@ -117,14 +114,14 @@ def multiplies(*tensors: Tensor) -> bool:
 def run_rows(
     kernel: Callable, arguments: Sequence, ranges: Iterable[Sequence[int]], most: int, work: int
 ) -> None:
-    """:func:`run` a kernel for parts of ranges of rows.
+    """Run a kernel on ranges of rows, divided into parts; see :func:`run`.
 
     Args:
         kernel: called as ``kernel(*arguments, *numbers, first, last)``.
-        arguments: of all calls.
-        ranges: each ``(*numbers, first, last)``.
-        most: rows of a call.
-        work: splats or entries of all ranges; little work uses no extra thread.
+        arguments: arguments common to all calls.
+        ranges: tuples ``(*numbers, first, last)``; ``last`` is excluded.
+        most: largest number of rows of a call.
+        work: number of splats or entries in all ranges; little work uses no extra thread.
     """
     tasks = []
     for *numbers, first, last in ranges:
@@ -135,11 +132,11 @@ def run_rows(
 
 
 def run(tasks: list, work: int) -> None:
-    """Call every task on at most ``torch.get_num_threads()`` threads, the caller's included.
+    """Call all tasks on at most ``torch.get_num_threads()`` threads, the caller's included.
 
     Args:
         tasks: functions without arguments.
-        work: splats or entries of all tasks; little work uses no extra thread.
+        work: number of splats or entries in all tasks; little work uses no extra thread.
     """
     helpers = min(torch.get_num_threads(), len(tasks), 1 + work // GRAIN) - 1
     queue = deque(tasks)

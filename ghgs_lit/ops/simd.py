@@ -1,11 +1,12 @@
 """Explicit vectors inside Numba kernels, compiled directly to LLVM vector instructions.
 
-LLVM cannot vectorise the masked inner loop of a rasterizer. A vector is 64 bytes, 16 floats or 8
-doubles: one AVX-512 register; on AVX2 and NEON LLVM splits each operation into two or four. A mask
-is one bit per lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says. A number
-combined with a vector is put into every lane. ``memory`` loads and stores vectors.
+LLVM cannot vectorise the masked inner loop of a rasterizer. A vector has 64 bytes, 16 floats or 8
+doubles: one AVX-512 register; for AVX2 and NEON, LLVM splits each operation into two or four. A mask
+is one bit per lane. No fast-math flag is set: NaN and infinity behave as in IEEE 754. A number that
+is combined with a vector is broadcast to every lane. :mod:`ghgs_lit.ops.memory` loads and stores
+vectors.
 
-Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
+Kernels call functions decorated with ``@intrinsic`` without their first parameter, Numba's
 ``typing_context``; ``emit(context, builder, sig, args)`` writes their LLVM instructions.
 """
 
@@ -62,13 +63,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def everywhere(builder, number, count: int):
-    """A vector with a number in each lane.
-
-    Args:
-        builder: of LLVM instructions.
-        number: LLVM value.
-        count: lanes.
-    """
+    """Broadcast a number, an LLVM value, to a vector of ``count`` lanes."""
     undefined = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
     one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, undefined, indices([0] * count))
@@ -76,38 +71,30 @@ def everywhere(builder, number, count: int):
 
 @lower_cast(types.Number, _Floats)
 def _fill(context, builder, source, kind, value):
-    """A number as a vector that has it in every lane.
-
-    Args:
-        context: Numba's, of the target.
-        builder: of LLVM instructions.
-        source: Numba type of the number.
-        kind: Numba type of the vector.
-        value: LLVM value of the number.
-    """
+    """Cast a number to a vector by broadcasting it to every lane."""
     return everywhere(builder, context.cast(builder, value, source, _SCALARS[kind]), kind.count)
 
 
 def _common(*args):
-    """The only kind of vector among the arguments; None if there are two kinds or none."""
+    """The vector type of the arguments; None if there is none or more than one."""
     kinds = {a for a in args if isinstance(a, _Lanes)}
     fits = len(kinds) == 1 and all(isinstance(a, (_Lanes, types.Number)) for a in args)
     return kinds.pop() if fits else None
 
 
 def _operator(function, family, result, emit):
-    """Define a Python operator for vectors.
+    """Define a Python operator, such as ``operator.add``, for vectors.
 
     Args:
-        function: the operator, such as ``operator.add``.
+        function: the operator.
         family: class of the operands.
-        result: maps the kind of the operands to that of the value.
-        emit: writes the instruction, from a builder and two operands.
+        result: maps the type of the operands to the type of the result.
+        emit: writes the instruction, given a builder and two operands.
     """
 
     class Template(AbstractTemplate):
         key = function
-        # Found before Numba's own templates, of which each operator has dozens.
+        # Numba tries templates of this target before its own, of which each operator has dozens.
         metadata = {"target": "cpu"}  # noqa: RUF012
 
         def generic(self, args, keywords):
@@ -135,16 +122,16 @@ _compare(operator.eq, "==")
 
 
 def constant(kind, value: float):
-    """A vector of a kind with ``value`` in every lane, known to the compiler."""
+    """Constant LLVM vector of a type with ``value`` in every lane."""
     return ir.Constant(kind.llvm, [value] * kind.count)
 
 
 def call(builder, name, kind, *args):
-    """Call an LLVM intrinsic whose arguments and result are vectors of one kind.
+    """Call an LLVM intrinsic whose arguments and result are vectors of one type.
 
     Args:
-        builder: of LLVM instructions.
-        name: of the intrinsic without ``llvm.`` and types, such as ``fmuladd``.
+        builder: LLVM IR builder.
+        name: name of the intrinsic without ``llvm.`` and types, such as ``fmuladd``.
         kind: Numba type of the vectors.
         args: LLVM values.
     """
@@ -154,19 +141,19 @@ def call(builder, name, kind, *args):
 
 
 def indices(values):
-    """Lanes for LLVM's ``shufflevector``, as a constant."""
+    """Constant vector of lane indices for LLVM's ``shufflevector``."""
     values = list(values)
     return ir.Constant(ir.VectorType(I32, len(values)), values)
 
 
 def vector_of(scalar):
-    """The kind of vector with lanes of float32 or float64."""
+    """Vector type with lanes of float32 or float64."""
     return _VECTORS[scalar]
 
 
 @intrinsic
 def full(typing_context, value):
-    """A vector with a float32 or float64 in every lane; other numbers become float64."""
+    """Broadcast a float32 or float64 to a vector; other numbers become float64."""
     kind = floats if value == types.float32 else doubles
     return kind(kind), lambda context, builder, sig, args: args[0]
 
