@@ -71,8 +71,8 @@ def stop_with(number):
 @pytest.mark.parametrize("places", [("seed=3",), ("-m", "seed=3,4"), ("seed=3", "hydra.run.dir=mine")])
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, number):
-    """The same command resumes in its directory, instead of starting anew or being rejected. SLURM requeues
-    a job that is ended early by itself, and one whose time is up (SIGUSR1) on request."""
+    """The same command resumes in its directory, instead of starting anew or being rejected. SLURM itself
+    requeues a job that ends early, and requeues one whose time is up (SIGUSR1) on request."""
     monkeypatch.setattr(train_verb, "train", stop_with(number))
     code, _, err = call(monkeypatch, capsys, "train", *places)
     assert code == 128 + number
