@@ -300,23 +300,24 @@ def check(person: Person) -> None:
         print(f"attention changes tokens by {change:.0%}")
 
 
-def print_table(results: list[dict]) -> None:
-    """Print means over the seeds that all rows have, and shares of the ceiling with 95 % intervals."""
+def print_table(results: list[dict], rows: list[str]) -> None:
+    """Print means over the seeds that all rows have, and shares of the ceiling with 95 % intervals; ``rows``
+    include ``none`` and ``ceiling``."""
     values = {(one["row"], one["seed"]): (one["surface_mm"], one["psnr"]) for one in results}
-    seeds = [seed for seed in range(100) if all((row, seed) in values for row in ROWS)]
-    table = np.array([[values[row, seed] for seed in seeds] for row in ROWS])  # row, seed, metric, person
+    seeds = [seed for seed in range(100) if all((row, seed) in values for row in rows)]
+    table = np.array([[values[row, seed] for seed in seeds] for row in rows])  # row, seed, metric, person
     rng = np.random.default_rng(0)
     draws = []
     for _ in range(2000):
         chosen = table[:, rng.integers(len(seeds), size=len(seeds))]
         draws.append(chosen[..., rng.integers(table.shape[3], size=table.shape[3])].mean((1, 3)))
     means = np.stack([table.mean((1, 3)), *draws])  # draw, row, metric
-    none = means[:, :1]
-    shares = (means - none) / (means[:, [list(ROWS).index("ceiling")]] - none)
+    none = means[:, [rows.index("none")]]
+    shares = (means - none) / (means[:, [rows.index("ceiling")]] - none)
     low, high = np.percentile(shares[1:], (2.5, 97.5), axis=0)
     columns = "| mm | share of the ceiling | PSNR | share of the ceiling |"
     print(f"| row, {len(seeds)} seeds {columns}\n|---|---|---|---|---|")
-    for number, row in enumerate(ROWS):
+    for number, row in enumerate(rows):
         cells = []
         for metric in (0, 1):
             interval = f"{low[number, metric]:.1%} to {high[number, metric]:.1%}"
@@ -335,7 +336,7 @@ def main() -> None:
     path = given.folder / "results.jsonl"
     results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     if given.command == "table":
-        return print_table(results)
+        return print_table(results, given.rows)
     trained, held_out = read_people(given.folder)
     if given.command == "check":
         return check(held_out[0])

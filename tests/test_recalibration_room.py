@@ -55,7 +55,7 @@ def test_shares_are_those_of_the_ceiling(capsys):
     for number, row in enumerate(room.ROWS):
         values = {"surface_mm": [100.0 - number, 90.0 - number], "psnr": [20.0 + number, 21.0 + number]}
         results.append({"row": row, "seed": 1, **values})
-    room.print_table(results)
+    room.print_table(results, list(room.ROWS))
     printed = capsys.readouterr().out
     assert "| s = 1 | 94.00 | 16.7% (16.7% to 16.7%) | 21.50 | 16.7% (16.7% to 16.7%) |" in printed
     assert "| ceiling | 89.00 | 100.0%" in printed
