@@ -1,1 +1,1 @@
-"""A rasterizer for CPUs, in kernels with explicit vectors; ``layout`` describes their data."""
+"""A Gaussian rasterizer for CPUs in explicitly vectorised kernels; ``layout`` describes their data."""

@@ -12,22 +12,14 @@ from ghgs_lit.ops.compile import helper, kernel
 from ghgs_lit.ops.rasterization import layout, tables, tiles
 from ghgs_lit.ops.rasterization.tiles import BLOCKS, LANES, LEAST_ALPHA, ONE, ZERO
 
-# Entries between prefetching a splat and reading it.
+# Distance in entries from a splat that is read to the one that is prefetched.
 _AHEAD = 8
 
 
 @helper
 def _read(image, first, width, rows, columns, block):
-    """A block of a tile, as a vector of 16 floats; 0 outside ``rows`` x ``columns``.
-
-    Args:
-        image: flat float32 image.
-        first: index of the tile's first pixel.
-        width: of the image, in pixels.
-        rows: of the tile that lie in the image, at most 16.
-        columns: of the tile that lie in the image, at most 16.
-        block: number of the block in the tile, 0 to 15.
-    """
+    """Load a 4 x 4 block (0 to 15) of a tile as 16 floats, with 0 outside the tile's ``rows`` x
+    ``columns`` pixels in the flat image."""
     y = block // 4 * 4
     x = block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
@@ -44,19 +36,18 @@ def _read_gradients(
     view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth,
     upstream, suffix,
 ):  # fmt: skip
-    """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S``
-    of all splats.
+    """Fill ``upstream`` with the gradients of a tile's planes, and ``suffix`` with ``S`` of all splats.
 
-    With depth = D / A, ``dL/dD = g / A`` and ``dL/dA = -g depth / A``, so the parts of D and A
+    With depth = D / A, ``dL/dD = g / A`` and ``dL/dA = -g depth / A``, so the terms of D and A
     in ``S`` cancel.
 
     Args:
         view: index of the view.
         first: index of the tile's first pixel in a plane of the image.
-        height: of the image, in pixels.
-        width: of the image, in pixels.
-        rows: of the tile that lie in the image.
-        columns: of the tile that lie in the image.
+        height: image height in pixels.
+        width: image width in pixels.
+        rows: rows of the tile inside the image.
+        columns: columns of the tile inside the image.
         count: number of channels C, or a tuple of that length.
         image: flat [V C h w].
         alpha: flat [V h w].
@@ -64,9 +55,9 @@ def _read_gradients(
         d_image: gradient of the image, flat [V C h w].
         d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
         d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
-        upstream: gets gradients of the planes (C colours, ``w z``, ``w``), [(C + 2) PIXELS],
+        upstream: written, gradients of the planes (C colours, ``w z``, ``w``), [(C + 2) PIXELS],
             block by block.
-        suffix: gets ``S``, [PIXELS], block by block.
+        suffix: written, ``S``, [PIXELS], block by block.
     """
     channels = simd.length(count)
     start = view * height * width + first
@@ -100,26 +91,26 @@ def _read_gradients(
 def _differentiate_splat(
     records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
 ):
-    """Gradients of one entry: a splat in a tile.
-    Moves ``transmittance`` and ``suffix`` behind the splat.
+    """Compute the gradients of one entry (a splat in a tile), and advance ``transmittance`` and
+    ``suffix`` past the splat.
 
     Args:
         records: [splats, RECORD].
         s: index of the splat.
         colors: [N, C].
-        n: index of its Gaussian.
+        n: index of the splat's Gaussian.
         count: number of channels C, or a tuple of that length.
         x0: first column of the tile, in pixels.
         y0: first row of the tile, in pixels.
-        hit: blocks that the splat reaches, as bits.
-        pixels: places of the tile's pixels, from :func:`tiles.grid`.
-        transmittance: before the splat, [PIXELS]; afterwards behind it.
+        hit: bit mask of the blocks that the splat reaches.
+        pixels: coordinates of the tile's pixels, from :func:`tiles.grid`.
+        transmittance: in front of the splat, [PIXELS]; on return, behind it.
         upstream: gradients of the planes, from :func:`_read_gradients`.
-        suffix: ``S`` with this splat, [PIXELS]; afterwards without it.
-        sums: gets a row of 16 lanes for each gradient of an entry (see ``layout``), to be
+        suffix: ``S`` with this splat, [PIXELS]; on return, without it.
+        sums: written, a row of 16 lanes for each gradient of an entry (see ``layout``), to be
             summed over lanes.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel ends.
+        stop: transmittance at which a pixel terminates.
     """
     channels = simd.length(count)
     zero = simd.full(ZERO)
@@ -180,31 +171,31 @@ def backward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
-    """Write gradients of the drawn entries of tiles.
+    """Write the gradients of the rendered entries of tiles.
 
     Args:
-        some_tiles: indices of tiles of all views, int64.
+        some_tiles: indices of tiles, counted over all views, int64.
         tiles_x: number of tiles across a view.
         tiles_y: number of tiles down a view.
-        height: of the images, in pixels.
-        width: of the images, in pixels.
+        height: image height in pixels.
+        width: image width in pixels.
         views: cameras, float64 [V, VIEW].
         tile_starts: first entry of each tile, int64 [V tiles + 1].
-        entries: [entries, ENTRY], int32, as ``forward`` has left them.
-        shifts: splat minus Gaussian of each view, int64 [V].
+        entries: int32 [entries, ENTRY], in the order in which ``forward`` left them.
+        shifts: splat index minus Gaussian index in each view, int64 [V].
         records: [splats, RECORD].
         colors: [N, C].
         count: number of channels C, or a tuple of that length.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel ends.
-        drawn: number of entries that each tile has drawn, int64 [V tiles].
-        image: flat [V C h w], as drawn.
-        alpha: flat [V h w], as drawn.
-        depth: flat [V h w], as drawn.
+        stop: transmittance at which a pixel terminates.
+        drawn: number of rendered entries of each tile, int64 [V tiles].
+        image: rendered colours, flat [V C h w].
+        alpha: rendered alpha, flat [V h w].
+        depth: rendered depth, flat [V h w].
         d_image: gradient of the image, flat [V C h w].
         d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
         d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
-        gradients: gets the gradients by slot, flat [slots x gradient_width], from a cache line on.
+        gradients: written by slot, flat [slots x gradient_width], aligned to a cache line.
     """
     channels = simd.length(count)
     transmittance = simd.aligned(layout.PIXELS)

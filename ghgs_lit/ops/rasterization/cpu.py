@@ -1,4 +1,4 @@
-"""The CPU backend as a differentiable function of PyTorch."""
+"""The CPU rasterizer as a differentiable PyTorch function."""
 
 import threading
 from dataclasses import dataclass
@@ -20,20 +20,21 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 @dataclass(frozen=True)
 class Plan:
-    """The work of a call, without the values of the Gaussians.
-    View ``v`` shows batch element ``v // T``.
+    """Division of the work of a call, independent of the values of the Gaussians.
+
+    View ``v`` belongs to batch element ``v // T``.
 
     Attributes:
         views: cameras as rows of ``layout.VIEW`` doubles, [B T, VIEW].
-        edges: ends of the parts of each element, [B, P + 1].
+        edges: boundaries of the P parts of each element, as indices of Gaussians, [B, P + 1].
         shifts: Gaussian ``n`` is splat ``n + shifts[v]`` of view ``v``, [B T].
-        splats: their number in all views.
+        splats: number of splats in all views.
         shape: (B, T).
-        height: of the images, in pixels.
-        width: of the images, in pixels.
-        settings: constants of the image.
-        near: metres; least depth of a centre that is drawn.
-        far: metres; greatest depth of a centre that is drawn.
+        height: image height in pixels.
+        width: image width in pixels.
+        settings: constants of rendering.
+        near: smallest rendered depth of a centre, in metres.
+        far: largest rendered depth of a centre, in metres.
     """
 
     views: np.ndarray
@@ -49,19 +50,19 @@ class Plan:
 
     @classmethod
     def of(cls, gaussians, cameras, settings, near, far) -> "Plan":
-        """The plan for Gaussians and cameras, of which no values but those of the cameras are read.
+        """Make the plan; it depends on the cameras and on the numbers of Gaussians.
 
         Args:
-            gaussians: N of B elements.
+            gaussians: N Gaussians of B elements.
             cameras: [B, T].
-            settings: constants of the image.
-            near: metres; least depth of a centre that is drawn.
-            far: metres; greatest depth of a centre that is drawn.
+            settings: constants of rendering.
+            near: smallest rendered depth of a centre, in metres.
+            far: largest rendered depth of a centre, in metres.
         """
         counts = np.array(gaussians.splits, dtype=np.int64)
         views_each = cameras.shape[1]
         firsts = np.cumsum(counts) - counts
-        # Each view has whole vectors of splats, so two threads never write to the same vector.
+        # Each view has whole vectors of splats, so that no two threads write to the same vector.
         sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
         views = _view_rows(cameras, settings)
         edges = _part_edges(firsts, counts)
@@ -81,7 +82,7 @@ class Plan:
 
     @property
     def parts(self) -> list[tuple[int, int, int, int, slice]]:
-        """Parts as (batch element, part, first Gaussian, last Gaussian, views of the element)."""
+        """Non-empty parts as (batch element, part, first Gaussian, end, views of the element)."""
         views = self.shape[1]
         parts = []
         for b, edges in enumerate(self.edges):
@@ -93,12 +94,8 @@ class Plan:
 
 
 def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Ends [B, P + 1] of the parts of each element; all parts but the last are whole vectors.
-
-    Args:
-        firsts: index of each element's first Gaussian, [B].
-        counts: number of Gaussians of each element, [B].
-    """
+    """Boundaries [B, P + 1] of the parts of each element, of which all but the last are whole vectors,
+    from the first Gaussians and the counts of the elements, [B]."""
     threads = torch.get_num_threads()
     total = int(counts.sum())
     parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
@@ -128,12 +125,11 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
     return rows
 
 
-# Runs of tiles per thread: with several short ones, no thread waits long for the last one.
+# Runs of tiles per thread: several short runs balance the load of the threads.
 _RUNS = 8
-# Kernels are compiled for this number of channels, and once for all others.
+# Kernels are specialised for this number of channels, and compiled once for all others.
 _COLORS = 3
-# Limit of the lists of tiles and their gradients in bytes:
-# a splat that fills the frame is in all its tiles.
+# Limit in bytes of the tile lists and their gradients: a splat that fills the frame is in every list.
 _MEMORY = 1 << 32
 
 
@@ -142,21 +138,21 @@ def rasterize(
 ) -> Rendering:
     """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
 
-    Differentiable in the Gaussians, not in the cameras. The result has the same bits with any
-    number of threads.
+    Differentiable with respect to the Gaussians, not the cameras. The result is bitwise the same for
+    any number of threads.
 
     Args:
-        gaussians: of B elements, on a CPU, in metres.
+        gaussians: Gaussians of B elements, on a CPU, in metres.
         cameras: [B, T], in metres.
-        settings: constants of the image.
-        near: metres; least depth of a centre that is drawn.
-        far: metres; greatest depth of a centre that is drawn.
+        settings: constants of rendering.
+        near: smallest rendered depth of a centre, in metres.
+        far: largest rendered depth of a centre, in metres.
 
     Returns:
         Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
 
     Raises:
-        InputError: lists of tiles that would exceed :data:`_MEMORY`.
+        InputError: the tile lists would exceed 4 GiB (``_MEMORY``).
     """
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = Plan.of(gaussians, cameras, settings, near, far)
@@ -165,7 +161,7 @@ def rasterize(
 
 @dataclass
 class _Splats:
-    """Splats of all views, and entries of all tiles; see ``layout``.
+    """Splats of all views and entries of all tiles; see ``layout``.
 
     Attributes:
         records: [splats, RECORD], float32.
@@ -173,8 +169,8 @@ class _Splats:
         entry_starts: first slot of each splat, [splats], int32.
         tile_starts: first entry of each tile of each view, [B T tiles + 1], int64.
         entries: [entries, ENTRY], int32.
-        drawn: number of entries that each tile has drawn, [B T tiles], int64.
-        reached: whether an entry was drawn, by slot, [entries], uint8.
+        drawn: number of rendered entries of each tile, [B T tiles], int64.
+        reached: whether an entry was rendered, by slot, [entries], uint8.
     """
 
     records: np.ndarray
@@ -190,17 +186,16 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     """Project all Gaussians into their views and list the splats of each tile.
 
     Args:
-        plan: the work of the call.
-        means: metres, float32 [N, 3].
+        plan: division of the work.
+        means: in metres, float32 [N, 3].
         quaternions: wxyz of any length, float32 [N, 4].
         scales: standard deviations in metres, float32 [N, 3].
         opacities: float32 [N, 1].
         colors: float32 [N, C].
-        differentiable: whether there must be memory for gradients, too.
+        differentiable: count the memory of the gradients as well.
 
     Raises:
-        InputError: the lists and, if ``differentiable``,
-            their gradients would exceed :data:`_MEMORY`.
+        InputError: the lists and, if ``differentiable``, their gradients would exceed ``_MEMORY``.
     """
     settings = plan.settings
     tiles_x, tiles_y = plan.tiles
@@ -247,7 +242,7 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
-    """Tiles with entries, in runs of about equal work."""
+    """Divide the tiles that have entries into runs of about equal work."""
     counts = np.diff(tile_starts)
     tiles = np.flatnonzero(counts)
     threads = torch.get_num_threads()
@@ -261,16 +256,16 @@ def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, colors, plan: Plan):
-        """Draw all views.
+        """Render all views.
 
         Args:
-            ctx: keeps what the backward pass needs.
-            means: metres, float32 [N, 3], contiguous as all tensors here.
+            ctx: context of autograd.
+            means: in metres, float32 [N, 3]; contiguous, as are all tensors here.
             quaternions: wxyz of any length, float32 [N, 4].
             scales: standard deviations in metres, float32 [N, 3].
             opacities: float32 [N].
             colors: float32 [N, C].
-            plan: the work of the call.
+            plan: division of the work.
 
         Returns:
             Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
@@ -300,16 +295,16 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, d_image, d_alpha, d_depth):
-        """Gradients of the five inputs.
+        """Compute the gradients of the five inputs.
 
         Args:
-            ctx: what the forward pass has kept.
+            ctx: context of autograd.
             d_image: gradient of the image, [B, T, C, h, w]; None: 0.
             d_alpha: gradient of alpha, [B, T, 1, h, w]; None: 0.
             d_depth: gradient of the depth, [B, T, 1, h, w]; None: 0.
 
         Returns:
-            Gradients in the shapes of the inputs; None for the plan.
+            Gradients in the shapes of the inputs, and None for the plan.
         """
         *inputs, image, alpha, depth = ctx.saved_tensors
         plan = ctx.plan
@@ -341,12 +336,12 @@ class _Rasterize(torch.autograd.Function):
 
 
 _kept = threading.local()
-# Floats of scratch memory that a thread may keep: allocating them takes longer than filling them.
+# Floats of scratch memory that a thread may keep, since allocating takes longer than filling.
 _KEEP = 1 << 24
 
 
 def _scratch(count: int) -> np.ndarray:
-    """Aligned floats, valid until this thread calls this function again."""
+    """Aligned scratch floats, valid until the next call on this thread."""
     buffer = getattr(_kept, "buffer", None)
     if buffer is None or len(buffer) < count:
         buffer = simd.aligned_floats(count + count // 4)
@@ -355,8 +350,7 @@ def _scratch(count: int) -> np.ndarray:
 
 
 def _zeros(*shape: int) -> Tensor:
-    """Zeros by NumPy, in memory that the system has zeroed;
-    PyTorch would start threads to write them."""
+    """Zeros from NumPy, in memory zeroed by the system: PyTorch would start threads to write them."""
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
@@ -367,6 +361,5 @@ def _flat(tensor: Tensor | None) -> np.ndarray:
 
 
 def _channels(count: int):
-    """The number of channels for a kernel; as a tuple of that length,
-    it is a constant of the compiler."""
+    """The number of channels as kernels take it: a tuple of that length is a compile-time constant."""
     return (0,) * count if count == _COLORS else count

@@ -1,6 +1,8 @@
-"""Drawing of splats, one tile at a time, front to back. First each part of the Gaussians lists its
-splats in their tiles by index; then each tile sorts its list by depth with a stable sort. So the
-order does not depend on the number of parts or threads, and no sort is larger than a tile."""
+"""Rendering of splats, one tile at a time, front to back.
+
+First, each part of the Gaussians appends its splats to the lists of their tiles, by index; then each
+tile sorts its list stably by depth. The order therefore does not depend on the number of parts or
+threads, and no sort is larger than a tile."""
 
 import numpy as np
 
@@ -21,15 +23,15 @@ def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, nex
 
     Args:
         first: first Gaussian of the part.
-        last: the Gaussian after its last one.
-        shifts: splat minus Gaussian of each view of the element, int64 [T].
+        last: end of the part, excluded.
+        shifts: splat index minus Gaussian index in each view of the element, int64 [T].
         depths: positive, float32 [splats, 1].
         boxes: tiles that a splat touches, int32 [splats, 4].
         tiles_x: number of tiles across a view.
         slot: first slot of the part.
-        entry_starts: gets the first slot of every splat, int32 [splats].
-        next_free: place of the part's next entry in each tile, int64 [T, tiles]; moves on.
-        entries: gets the entries, int32 [entries, ENTRY].
+        entry_starts: written, the first slot of each splat, int32 [splats].
+        next_free: index of the part's next entry in each tile, int64 [T, tiles]; advanced.
+        entries: written, int32 [entries, ENTRY].
     """
     keys = depths.view(np.int32)
     for t in range(len(shifts)):
@@ -59,15 +61,8 @@ def _insertion_sort(keys, count):
 
 @helper
 def _radix_pass(keys, new_keys, count, shift, places):
-    """Sort stably by one digit of the keys.
-
-    Args:
-        keys: int64, not negative.
-        new_keys: gets the sorted keys.
-        count: number of keys.
-        shift: first bit of the digit.
-        places: room for 256 numbers, int64.
-    """
+    """Sort ``count`` non-negative int64 keys stably by the 8-bit digit at bit ``shift``, with a buffer
+    ``places`` of 256 int64."""
     places[:] = 0
     for i in range(count):
         places[(keys[i] >> shift) & (_BUCKETS - 1)] += 1
@@ -84,21 +79,21 @@ def _radix_pass(keys, new_keys, count, shift, places):
 
 @helper
 def depth_order(entries, start, end, keys, spare, places):
-    """The entries of a tile sorted stably by depth.
+    """Sort the entries of a tile stably by depth.
 
-    Bits of positive floats sort like integers; relative to a tile's smallest, only a few low digits
-    differ.
+    Bit patterns of positive floats sort like integers, and relative to the smallest of a tile only a
+    few low digits differ.
 
     Args:
         entries: int32 [entries, ENTRY].
         start: first entry of the tile.
-        end: the entry after its last one; more than ``start``.
-        keys: room for as many int64.
-        spare: room for as many int64.
-        places: room for 256 int64.
+        end: end of the tile's entries, excluded; greater than ``start``.
+        keys: buffer for as many int64 as the tile has entries.
+        spare: a second buffer of that size.
+        places: buffer for 256 int64.
 
     Returns:
-        Keys, a part of ``keys`` or ``spare``, whose lower halves are rows of ``entries``.
+        Keys, a view of ``keys`` or ``spare``, whose lower halves are rows of ``entries``.
     """
     count = end - start
     least = entries[start, layout.KEY]
@@ -120,25 +115,25 @@ def depth_order(entries, start, end, keys, spare, places):
     return keys[:count]
 
 
-# Entries that are drawn into all blocks before the next ones are read: the bits of an integer.
+# Entries that are blended into all blocks before the next ones are read: one per bit of an integer.
 _CHUNK = 64
-# Places of depth and colours in a gathered row, after the values of ``tiles.read_splat``.
+# Rows of depth and colours in a gathered chunk, after the values of ``tiles.read_splat``.
 _DEPTH = 7
 _COLOR = 8
 
 
 @helper
 def _touches(numbers, slope_x, slope_y, block):
-    """Which of 16 splats have an ellipse that meets a block, as bits.
+    """Bit mask of those of 16 splats whose ellipse meets a block.
 
     The smallest p^2 + q^2 over a box lies on its column or row nearest to the splat's centre, at
-    the minimum along it. The comparison is slightly generous, since it only saves work.
+    the minimum along it. The comparison has a small tolerance, since it only saves work.
 
     Args:
-        numbers: vectors of :func:`tiles.read_splat`, one lane for each splat.
+        numbers: vectors from :func:`tiles.read_splat`, one lane per splat.
         slope_x: dx / dy of the minimum along a row of pixels.
         slope_y: dy / dx of the minimum along a column of pixels.
-        block: number of the block in the tile, 0 to 15.
+        block: index of the block in the tile, 0 to 15.
     """
     side = np.float32(layout.BLOCK - 1)
     left = numbers[0] + np.float32(block % 4 * 4)
@@ -157,17 +152,17 @@ def _touches(numbers, slope_x, slope_y, block):
 
 @helper
 def _fetch(order, i, entries, shift, records, colors, splats):
-    """Write the splats of a chunk, filled up with the last one;
-    prefetch the records of the next chunk.
+    """Write the indices of the splats of a chunk, padded with the last one, and prefetch the records of
+    the next chunk.
 
     Args:
         order: keys of the tile's entries, from :func:`depth_order`.
         i: first key of the chunk.
         entries: int32 [entries, ENTRY].
-        shift: splat minus Gaussian in this view.
+        shift: splat index minus Gaussian index in this view.
         records: [splats, RECORD].
         colors: [N, C].
-        splats: gets ``_CHUNK`` indices of splats, int64.
+        splats: written, int64 [_CHUNK].
     """
     for k in range(_CHUNK):
         splats[k] = entries[order[min(i + k, len(order) - 1)] & 0xFFFFFFFF, layout.SPLAT]
@@ -182,16 +177,16 @@ def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo)
 
     Args:
         splats: indices of splats, int64 [_CHUNK].
-        count: number of them that belong to the tile, at most ``_CHUNK``.
-        shift: splat minus Gaussian in this view.
+        count: number of splats without padding, at most ``_CHUNK``.
+        shift: splat index minus Gaussian index in this view.
         records: [splats, RECORD].
         colors: [N, C].
         x0: first column of the tile, in pixels.
         y0: first row of the tile, in pixels.
-        live: blocks through which light still passes, as bits.
-        rows: gets ``_CHUNK`` numbers for each value of :func:`tiles.read_splat`, the depth,
-            and each channel.
-        todo: gets the splats that touch each block, as bits, int64 [BLOCKS].
+        live: bit mask of the blocks that are not yet opaque.
+        rows: written, ``_CHUNK`` numbers for each value of :func:`tiles.read_splat`, the depth and each
+            channel.
+        todo: written, bit masks of the splats that touch each block, int64 [BLOCKS].
     """
     todo[:] = 0
     for i in range(0, count, LANES):
@@ -222,7 +217,7 @@ def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo)
 
 @helper
 def _add(planes, position, value):
-    """Add a vector to the numbers from ``position`` on."""
+    """Add a vector to the numbers that start at ``position``."""
     memory.store(planes, position, memory.load(planes, position) + value)
 
 
@@ -231,19 +226,19 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
     """Blend splats into a block, front to back.
 
     Args:
-        block: number of the block in the tile, 0 to 15.
-        todo: the chunk's splats to blend, as bits.
-        rows: their numbers, from :func:`_list_chunk`.
+        block: index of the block in the tile, 0 to 15.
+        todo: bit mask of the chunk's splats to blend.
+        rows: numbers of the splats, from :func:`_list_chunk`.
         count: number of channels C, or a tuple of that length.
-        pixels: places of the tile's pixels, from :func:`tiles.grid`.
-        planes: sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS]; grow.
-        transmittance: of the tile, [PIXELS]; falls.
+        pixels: coordinates of the tile's pixels, from :func:`tiles.grid`.
+        planes: accumulated, sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS].
+        transmittance: updated, transmittance of the tile, [PIXELS].
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel ends.
-        hits: gets the block's bit for each splat that reaches it, int32 [_CHUNK].
+        stop: transmittance at which a pixel terminates.
+        hits: the block's bit is set for each splat that reaches the block, int32 [_CHUNK].
 
     Returns:
-        Whether light still passes.
+        Whether any pixel of the block is not yet opaque.
     """
     at = block * LANES
     bit = np.int32(1) << block
@@ -263,7 +258,7 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
             hits[i] |= bit
         weight = simd.select(seen, before * alpha, ZERO)
         for c in range(simd.length(count)):
-            # Selected after the product: 0 times a colour that is not finite would be NaN.
+            # Select after the product: 0 times a colour that is not finite would be NaN.
             color = simd.select(seen, weight * rows[(_COLOR + c) * _CHUNK + i], ZERO)
             _add(planes, c * layout.PIXELS + at, color)
         _add(planes, simd.length(count) * layout.PIXELS + at, weight * rows[_DEPTH * _CHUNK + i])
@@ -277,17 +272,8 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
 
 @helper
 def _write(image, first, width, rows, columns, block, value):
-    """Write the part of a block that lies in the image.
-
-    Args:
-        image: flat float32 image.
-        first: index of the tile's first pixel.
-        width: of the image, in pixels.
-        rows: of the tile that lie in the image, at most 16.
-        columns: of the tile that lie in the image, at most 16.
-        block: number of the block in the tile, 0 to 15.
-        value: the block, a vector of 16 floats.
-    """
+    """Write a 4 x 4 block (0 to 15) of a tile, a vector of 16 floats, to the tile's ``rows`` x
+    ``columns`` pixels in the flat image."""
     y = block // 4 * 4
     x = block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
@@ -308,14 +294,14 @@ def _write_planes(planes, view, first, height, width, rows, columns, channels, i
         planes: sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS].
         view: index of the view.
         first: index of the tile's first pixel in a plane of the image.
-        height: of the image, in pixels.
-        width: of the image, in pixels.
-        rows: of the tile that lie in the image.
-        columns: of the tile that lie in the image.
+        height: image height in pixels.
+        width: image width in pixels.
+        rows: rows of the tile inside the image.
+        columns: columns of the tile inside the image.
         channels: C.
-        image: flat [V C h w].
-        alpha: gets the sum of ``w``, flat [V h w].
-        depth: gets the expected depth, the sum of ``w z`` over that of ``w``, flat [V h w].
+        image: written, flat [V C h w].
+        alpha: written, the sum of ``w``, flat [V h w].
+        depth: written, the expected depth: the sum of ``w z`` over the sum of ``w``, flat [V h w].
     """
     for block in range(BLOCKS):
         at = block * LANES
@@ -334,28 +320,28 @@ def forward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, reached, image, alpha, depth,
 ):  # fmt: skip
-    """Draw tiles, and note for the backward pass what was drawn (see ``layout``).
+    """Render tiles, and keep the rendered entries for the backward pass (see ``layout``).
 
     Args:
-        some_tiles: indices of tiles of all views, int64.
+        some_tiles: indices of tiles, counted over all views, int64.
         tiles_x: number of tiles across a view.
         tiles_y: number of tiles down a view.
-        height: of the images, in pixels.
-        width: of the images, in pixels.
+        height: image height in pixels.
+        width: image width in pixels.
         views: cameras, float64 [V, VIEW].
         tile_starts: first entry of each tile, int64 [V tiles + 1].
-        entries: int32 [entries, ENTRY]; the drawn ones are moved to the front of each tile.
-        shifts: splat minus Gaussian of each view, int64 [V].
+        entries: int32 [entries, ENTRY]; the rendered ones are moved to the front of each tile.
+        shifts: splat index minus Gaussian index in each view, int64 [V].
         records: [splats, RECORD].
         colors: [N, C].
         count: number of channels C, or a tuple of that length.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel ends.
-        drawn: gets the number of drawn entries of each tile, int64 [V tiles].
-        reached: gets 1 at the slots of drawn entries, uint8 [entries].
-        image: gets colours on black, flat [V C h w].
-        alpha: flat [V h w].
-        depth: gets the expected depth, flat [V h w].
+        stop: transmittance at which a pixel terminates.
+        drawn: written, number of rendered entries of each tile, int64 [V tiles].
+        reached: set to 1 at the slots of rendered entries, uint8 [entries].
+        image: written, colours on black, flat [V C h w].
+        alpha: written, flat [V h w].
+        depth: written, expected depth, flat [V h w].
     """
     channels = simd.length(count)
     longest = 1

@@ -1,6 +1,7 @@
-"""Geometry of eight splats at once in doubles, for the projection and its gradient. Points, vectors
-and matrices (row by row) are tuples of vectors of eight doubles. Doubles cost little, as they are
-used once per splat, not per pixel, and with them no finite float32 input overflows."""
+"""Geometry of eight splats at once in double precision, for the projection and its gradient.
+
+Points, vectors and matrices (row by row) are tuples of vectors of eight doubles. Double precision
+costs little, since it is used per splat and not per pixel, and no finite float32 input overflows."""
 
 import math
 
@@ -15,13 +16,9 @@ K_SCALE = math.sqrt(0.5 * TO_LOG2)
 
 @helper
 def unit(quaternions):
-    """Unit quaternions, and 1 / norm; the identity and 0 for the zero quaternion.
+    """Normalise quaternions (w, x, y, z); returns w, x, y, z and 1 / norm.
 
-    Args:
-        quaternions: w, x, y and z.
-
-    Returns:
-        w, x, y, z, and 1 / norm.
+    A zero quaternion gives the identity and 0.
     """
     w, x, y, z = quaternions
     norm = simd.sqrt(w * w + x * x + (y * y + z * z))
@@ -33,14 +30,7 @@ def unit(quaternions):
 
 @helper
 def rotation(w, x, y, z):
-    """Rotation matrices of unit quaternions, row by row.
-
-    Args:
-        w: real part.
-        x: first imaginary part.
-        y: second imaginary part.
-        z: third imaginary part.
-    """
+    """Rotation matrices of unit quaternions, row by row."""
     x2 = x + x
     y2 = y + y
     z2 = z + z
@@ -62,12 +52,7 @@ def rotation(w, x, y, z):
 
 @helper
 def scaled(r, s):
-    """``R S``: the columns of R times the scales.
-
-    Args:
-        r: 3 x 3.
-        s: three scales.
-    """
+    """``R S``: the columns of the 3 x 3 matrix ``r`` times the three scales ``s``."""
     return (
         r[0] * s[0], r[1] * s[1], r[2] * s[2], r[3] * s[0], r[4] * s[1], r[5] * s[2],
         r[6] * s[0], r[7] * s[1], r[8] * s[2],
@@ -76,22 +61,13 @@ def scaled(r, s):
 
 @helper
 def dot(a, b, c, x, y, z):
-    """``a x + b y + c z``.
-
-    Args:
-        a: first number of the first vector.
-        b: its second number.
-        c: its third number.
-        x: first number of the second vector.
-        y: its second number.
-        z: its third number.
-    """
+    """``a x + b y + c z``."""
     return simd.fma(a, x, simd.fma(b, y, c * z))
 
 
 @helper
 def camera_points(view, mean):
-    """World points in camera axes.
+    """Transform world points to camera axes.
 
     Args:
         view: a camera, [VIEW].
@@ -111,13 +87,7 @@ def camera_points(view, mean):
 
 @helper
 def clamped(view, x, y):
-    """x / z and y / z clamped to the frame and its margin, for the Jacobian.
-
-    Args:
-        view: a camera, [VIEW].
-        x: x / z.
-        y: y / z.
-    """
+    """Clamp x / z and y / z to the frame and its margin, for the Jacobian."""
     x = simd.minimum(simd.maximum(x, view[layout.X_LOW]), view[layout.X_HIGH])
     y = simd.minimum(simd.maximum(y, view[layout.Y_LOW]), view[layout.Y_HIGH])
     return x, y
@@ -175,8 +145,8 @@ def determinants(m, n, low_pass):
 
     Args:
         m: 2 x 3, from :func:`footprint`.
-        n: its :func:`normal`.
-        low_pass: px^2.
+        n: :func:`normal` of ``m``.
+        low_pass: added variance in px^2.
     """
     bare = dot(n[0], n[1], n[2], n[0], n[1], n[2])
     xx = dot(m[0], m[1], m[2], m[0], m[1], m[2])

@@ -1,6 +1,6 @@
-"""Gradients of Gaussians from gradients of entries: the derivative of the projection, eight
-at a time. Sums have a fixed order (entries of a splat, then views), so results do not depend
-on threads."""
+"""Gradients of Gaussians from gradients of entries: the derivative of the projection, eight at a time.
+
+Sums have a fixed order (entries of a splat, then views), so that results do not depend on threads."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ _ROOT = 3
 _OPACITY = 12
 _SUMS = 13
 
-# Each K, and so each whitened coordinate, contains a factor K_SCALE.
+# Each K, and therefore each whitened coordinate, contains a factor K_SCALE.
 _FIRST_MOMENT = geometry.K_SCALE**-2
 _SECOND_MOMENT = geometry.K_SCALE**-4
 
@@ -28,13 +28,13 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
         m: first splat.
         boxes: tiles that a splat touches, int32 [splats, 4].
         entry_starts: first slot of each splat, int32 [splats].
-        reached: whether an entry was drawn, by slot, uint8 [entries].
-        gradients: of entries, by slot, flat [slots x width].
-        width: floats of an entry's gradients, in whole vectors.
-        lines: gets the sums of each drawn splat, [8 width]; the lines of others stay.
+        reached: whether an entry was rendered, by slot, uint8 [entries].
+        gradients: gradients of entries, by slot, flat [slots x width].
+        width: number of floats of an entry's gradients, in whole vectors.
+        lines: written, the sums of each rendered splat, [8 width]; lines of other splats are unchanged.
 
     Returns:
-        The drawn splats, as bits.
+        Bit mask of the rendered splats.
     """
     drawn = 0
     for lane in range(_WIDE):
@@ -58,14 +58,14 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
 def _footprint_gradient(moments, record, m, low_pass, antialiased):
     """``dL/dM`` (2 x 3) and ``dL/d opacity`` of eight splats.
 
-    The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and
+    The gradient of the covariance is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and
     ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains ``(det before / det after)^(1/2)``.
 
     Args:
-        moments: gradients of entries, summed (see ``layout``); tuple of vectors.
-        record: record of the splats (see ``layout``); tuple of vectors.
+        moments: summed gradients of entries (see ``layout``), a tuple of vectors.
+        record: records of the splats (see ``layout``), a tuple of vectors.
         m: 2 x 3, from :func:`geometry.footprint`.
-        low_pass: px^2.
+        low_pass: added variance in px^2.
         antialiased: whether opacity was scaled by the determinants.
     """
     k_xx = record[layout.K_XX]
@@ -109,8 +109,8 @@ def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_
         view: a camera, [VIEW].
         x: x / z of the point.
         y: y / z of the point.
-        clamped_x: x / z at which the Jacobian was taken.
-        clamped_y: y / z at which the Jacobian was taken.
+        clamped_x: x / z at which the Jacobian was evaluated.
+        clamped_y: y / z at which the Jacobian was evaluated.
         inverse: 1 / z.
         d_u: gradient of the centre's column.
         d_v: gradient of the centre's row.
@@ -133,14 +133,8 @@ def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_
 
 @helper
 def _add(sums, k, drawn, value):
-    """Add to a row in the drawn lanes only; values in others may not be finite.
-
-    Args:
-        sums: rows of 8 doubles.
-        k: the row.
-        drawn: mask of eight lanes.
-        value: eight doubles.
-    """
+    """Add eight doubles to row ``k`` of ``sums`` in the lanes of ``drawn`` only, since values in others
+    may not be finite."""
     old = memory.load(sums, k * _WIDE)
     memory.store(sums, k * _WIDE, simd.select(drawn, old + value, old))
 
@@ -153,12 +147,12 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
         view: a camera, [VIEW].
         mean: x, y and z in metres.
         root: ``R S``, 3 x 3.
-        moments: gradients of entries, summed (see ``layout``).
-        record: record of the splats (see ``layout``).
-        drawn: mask of eight lanes: the splats that were drawn.
-        low_pass: px^2.
+        moments: summed gradients of entries (see ``layout``).
+        record: records of the splats (see ``layout``).
+        drawn: mask of the rendered splats, eight lanes.
+        low_pass: added variance in px^2.
         antialiased: whether opacity was scaled by the determinants.
-        sums: rows of 8 doubles: gradients of the mean, of ``R S`` and of the opacity; grow.
+        sums: accumulated, rows of 8 doubles: gradients of the mean, of ``R S`` and of the opacity.
     """
     x, y, _, inverse = geometry.camera_points(view, mean)
     clamped_x, clamped_y = geometry.clamped(view, x, y)
@@ -194,7 +188,7 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
 
 @helper
 def _root_rows(sums):
-    """The gradient of ``R S`` as a 3 x 3 matrix, from its rows of ``sums``."""
+    """Load the gradient of ``R S`` from its rows of ``sums`` as a 3 x 3 matrix."""
     at = _ROOT * _WIDE
     return (
         memory.load(sums, at), memory.load(sums, at + 8), memory.load(sums, at + 16),
@@ -205,16 +199,8 @@ def _root_rows(sums):
 
 @helper
 def _quaternion_gradient(w, x, y, z, inverse, d):
-    """Gradient of quaternions from that of their rotation matrices, orthogonal to the quaternions.
-
-    Args:
-        w: real part of the unit quaternion.
-        x: first imaginary part.
-        y: second imaginary part.
-        z: third imaginary part.
-        inverse: 1 / norm of the quaternion before it was normalised.
-        d: gradient of the rotation matrix, 3 x 3.
-    """
+    """Gradient of a quaternion of norm ``1 / inverse``, orthogonal to it, from the unit quaternion and
+    the gradient ``d`` (3 x 3) of its rotation matrix."""
     d_w = 2.0 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1]))
     d_x = 2.0 * (y * (d[1] + d[3]) + z * (d[2] + d[6]) + w * (d[7] - d[5]) - 2.0 * x * (d[4] + d[8]))
     d_y = 2.0 * (x * (d[1] + d[3]) + z * (d[5] + d[7]) + w * (d[2] - d[6]) - 2.0 * y * (d[0] + d[8]))
@@ -234,25 +220,25 @@ def collect(
     """Write the gradients of Gaussians ``first`` to ``last``, summed over ``views``.
 
     Args:
-        means: metres, [N, 3].
+        means: in metres, [N, 3].
         quaternions: wxyz of any length, [N, 4].
-        scales: metres, [N, 3].
+        scales: in metres, [N, 3].
         first: first Gaussian of the part.
-        last: the Gaussian after its last one.
-        views: cameras that show the part, float64 [T, VIEW].
-        shifts: splat minus Gaussian of each of these views, int64 [T].
-        low_pass: px^2.
+        last: end of the part, excluded.
+        views: cameras of the part's batch element, float64 [T, VIEW].
+        shifts: splat index minus Gaussian index in each of these views, int64 [T].
+        low_pass: added variance in px^2.
         antialiased: whether opacity was scaled by the determinants.
         records: [splats, RECORD].
         boxes: tiles that a splat touches, int32 [splats, 4].
         entry_starts: first slot of each splat, int32 [splats].
-        reached: whether an entry was drawn, by slot, uint8 [entries].
-        gradients: of entries, by slot, from ``backward``.
-        d_means: gets [N, 3].
-        d_quaternions: gets [N, 4].
-        d_scales: gets [N, 3].
-        d_opacities: gets [N, 1].
-        d_colors: gets [N, C].
+        reached: whether an entry was rendered, by slot, uint8 [entries].
+        gradients: gradients of entries, by slot, from ``backward``.
+        d_means: written, [N, 3].
+        d_quaternions: written, [N, 4].
+        d_scales: written, [N, 3].
+        d_opacities: written, [N, 1].
+        d_colors: written, [N, C].
     """
     channels = d_colors.shape[1]
     width = layout.kernel_gradient_width(channels)

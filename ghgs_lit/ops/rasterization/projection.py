@@ -1,4 +1,4 @@
-"""Perspective projection of Gaussians to splats, eight at a time, in doubles."""
+"""Perspective projection of Gaussians to splats, eight at a time, in double precision."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from ghgs_lit.ops.compile import helper, kernel
 from ghgs_lit.ops.rasterization import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
-# Splats farther away, in pixels, are not drawn; up to here float32 does not overflow.
+# Splats whose centre is farther away, in pixels, are not rendered: float32 could overflow.
 _FAR = 1e30
 
 
@@ -17,11 +17,11 @@ def _extents(view, u, v, a, c, cutoff):
 
     Args:
         view: a camera, [VIEW].
-        u: column of the centre, in pixels.
-        v: row of the centre, in pixels.
-        a: variance across, px^2, with the low-pass filter.
-        c: variance down, px^2, with the low-pass filter.
-        cutoff: largest p^2 + q^2 that is drawn.
+        u: column of the splat's centre, in pixels.
+        v: row of the splat's centre, in pixels.
+        a: variance across in px^2, low-pass included.
+        c: variance down in px^2, low-pass included.
+        cutoff: largest p^2 + q^2 that is rendered.
 
     Returns:
         Left, right, top and bottom.
@@ -47,21 +47,21 @@ def _project_vector(
         view: a camera, [VIEW].
         mean: x, y and z in metres.
         root: ``R S``, 3 x 3.
-        opacity: of the Gaussians.
-        near: metres; least depth that is drawn.
-        far: metres; greatest depth that is drawn.
-        low_pass: px^2.
-        extent: standard deviations beyond which a Gaussian is cut off.
-        alpha_min: least alpha that is drawn.
+        opacity: opacities of the Gaussians.
+        near: smallest rendered depth, in metres.
+        far: largest rendered depth, in metres.
+        low_pass: added variance in px^2.
+        extent: cut-off radius in standard deviations.
+        alpha_min: smallest rendered alpha.
         antialiased: scale opacity by the determinants.
         m: first splat.
-        records: gets the records, [splats, RECORD].
-        depths: gets z in metres, [splats, 1].
-        boxes: gets the tiles that each splat touches, int32 [splats, 4];
-            empty if it is not visible.
+        records: written, [splats, RECORD].
+        depths: written, z in metres, [splats, 1].
+        boxes: written, the tiles that each splat touches, int32 [splats, 4]; empty if it is not
+            visible.
 
     Returns:
-        The visible splats, as bits.
+        Bit mask of the visible splats.
     """
     x, y, z, inverse = geometry.camera_points(view, mean)
     clamped_x, clamped_y = geometry.clamped(view, x, y)
@@ -114,26 +114,26 @@ def project(
     """Project Gaussians ``first`` to ``last`` into all ``views``.
 
     Args:
-        means: metres, [N, 3].
+        means: in metres, [N, 3].
         quaternions: wxyz of any length, [N, 4].
-        scales: metres, [N, 3].
+        scales: in metres, [N, 3].
         opacities: [N, 1].
         colors: [N, C].
         first: first Gaussian of the part.
-        last: the Gaussian after its last one.
-        views: cameras that show the part, float64 [T, VIEW].
-        shifts: splat minus Gaussian of each of these views, int64 [T].
-        near: metres; least depth that is drawn.
-        far: metres; greatest depth that is drawn.
-        low_pass: px^2.
-        extent: standard deviations beyond which a Gaussian is cut off.
-        alpha_min: least alpha that is drawn.
+        last: end of the part, excluded.
+        views: cameras of the part's batch element, float64 [T, VIEW].
+        shifts: splat index minus Gaussian index in each of these views, int64 [T].
+        near: smallest rendered depth, in metres.
+        far: largest rendered depth, in metres.
+        low_pass: added variance in px^2.
+        extent: cut-off radius in standard deviations.
+        alpha_min: smallest rendered alpha.
         antialiased: scale opacities by the determinants.
         tiles_x: number of tiles across a view.
-        records: gets the records, [splats, RECORD].
-        depths: gets z in metres, [splats, 1].
-        boxes: gets the tiles that each splat touches, int32 [splats, 4].
-        tile_counts: the part's entries in each tile, int64 [T, tiles]; grow.
+        records: written, [splats, RECORD].
+        depths: written, z in metres, [splats, 1].
+        boxes: written, the tiles that each splat touches, int32 [splats, 4].
+        tile_counts: incremented, the part's entries in each tile, int64 [T, tiles].
     """
     for n in range(first, last, _WIDE):
         mean = tables.columns3(means, n, last)

@@ -1,8 +1,8 @@
 """Loads and stores of vectors: 4 x 4 blocks of an image, columns of a table, transposed rows.
 
-Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
-``typing_context``; their others are Numba types when a kernel is compiled.
-``emit(context, builder, sig, args)`` writes the LLVM instructions: ``builder`` adds to the kernel's
+Kernels call functions decorated with ``@intrinsic`` without their first parameter, Numba's
+``typing_context``; the other parameters are Numba types when a kernel is compiled.
+``emit(context, builder, sig, args)`` writes the LLVM instructions: ``builder`` appends to the kernel's
 code, ``args`` are the LLVM values of the parameters. Arrays are contiguous.
 """
 
@@ -19,17 +19,8 @@ _INT8 = ir.VectorType(I32, DOUBLES)
 
 
 def _block_rows(context, builder, array_type, array, index, stride, index_type):
-    """Addresses of the four rows of four floats of a block whose first pixel is ``array[index]``.
-
-    Args:
-        context: Numba's, of the target.
-        builder: of LLVM instructions.
-        array_type: Numba type of a flat float32 array.
-        array: its LLVM value.
-        index: index of the first pixel, an LLVM integer.
-        stride: floats from one row of the image to the next.
-        index_type: Numba type of ``index`` and ``stride``.
-    """
+    """Addresses of the four rows of a 4 x 4 block that starts at ``array[index]`` of a flat float32
+    image with rows of ``stride`` floats; ``index_type`` is the Numba type of ``index`` and ``stride``."""
     data = context.make_array(array_type)(context, builder, array).data
     position = context.cast(builder, index, index_type, types.intp)
     step = context.cast(builder, stride, index_type, types.intp)
@@ -43,12 +34,12 @@ def _block_rows(context, builder, array_type, array, index, stride, index_type):
 
 @intrinsic
 def load_block(typing_context, array, index, stride):
-    """The 4 x 4 pixels of a flat image from ``index`` on, as a vector of 16 floats.
+    """Load a 4 x 4 block of a flat image as a vector of 16 floats, row by row.
 
     Args:
         typing_context: Numba's.
         array: flat float32 image.
-        index: of the first pixel.
+        index: index of the first pixel.
         stride: floats from one row of the image to the next.
     """
 
@@ -64,12 +55,12 @@ def load_block(typing_context, array, index, stride):
 
 @intrinsic
 def store_block(typing_context, array, index, stride, value):
-    """Write a vector to 4 x 4 pixels of a flat image.
+    """Write a vector to a 4 x 4 block of a flat image.
 
     Args:
         typing_context: Numba's.
         array: flat float32 image.
-        index: of the first pixel.
+        index: index of the first pixel.
         stride: floats from one row of the image to the next.
         value: 16 floats, row by row.
     """
@@ -84,14 +75,8 @@ def store_block(typing_context, array, index, stride, value):
 
 
 def _fold(builder, first, second, width):
-    """A vector with the sums of the two halves of every group of ``width`` lanes of two vectors.
-
-    Args:
-        builder: of LLVM instructions.
-        first: 16 floats.
-        second: 16 floats.
-        width: lanes of a group, a power of two.
-    """
+    """Add the two halves of every group of ``width`` lanes, a power of two, of two vectors of 16 floats,
+    giving one vector."""
     low = [i for i in range(2 * LANES) if i % width < width // 2]
     high = [i + width // 2 for i in low]
     return builder.fadd(
@@ -102,14 +87,14 @@ def _fold(builder, first, second, width):
 
 @intrinsic
 def row_sums(typing_context, array, index, count):
-    """Sums of 16 rows of 16 floats, row ``k`` in lane ``k``, in a fixed order.
+    """Sum each of 16 rows of 16 floats in a fixed order; lane ``k`` is the sum of row ``k``.
 
     Args:
         typing_context: Numba's.
         array: flat float32, aligned to a cache line.
-        index: of the first number.
-        count: number of channels, or a tuple of that length: then rows from ``COLOR + len(count)``
-            on count as 0.
+        index: index of the first number.
+        count: number of channels, or a tuple of that length, in which case rows from
+            ``COLOR + len(count)`` on count as 0.
     """
     used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
@@ -130,17 +115,8 @@ def row_sums(typing_context, array, index, count):
 
 
 def _flat_rows(context, builder, array_type, args, index_type, count, kind):
-    """Address of row ``index`` of a table with ``count`` columns.
-
-    Args:
-        context: Numba's, of the target.
-        builder: of LLVM instructions.
-        array_type: Numba type of the table.
-        args: LLVM values of the table and the index, first and second.
-        index_type: Numba type of the index.
-        count: columns.
-        kind: LLVM type that the address points to.
-    """
+    """Address, as a pointer to LLVM type ``kind``, of a row of a table with ``count`` columns; ``args``
+    starts with the LLVM values of the table and the row."""
     position = builder.mul(
         context.cast(builder, args[1], index_type, types.intp), ir.Constant(args[1].type, count)
     )
@@ -151,15 +127,15 @@ def _masked(builder, name: str, kind, rows, count: int, *args):
     """Load or store the first rows of a vector of eight rows of ``count`` floats.
 
     Args:
-        builder: of LLVM instructions.
+        builder: LLVM IR builder.
         name: ``load`` or ``store``.
         kind: LLVM type of the vector.
-        rows: how many rows to touch, an LLVM integer; all if more than eight.
-        count: floats of a row.
-        args: the address, after the value if it is a store.
+        rows: number of rows to load or store, an LLVM integer; more than eight means all.
+        count: number of floats of a row.
+        args: the address; for a store, preceded by the value.
 
     Returns:
-        The vector that was loaded, 0 in rows that were not; for a store, nothing.
+        For a load, the vector, with 0 in rows that were not loaded.
     """
     wide = ir.VectorType(I64, kind.count)
     lanes = range(kind.count)
@@ -178,19 +154,19 @@ def _masked(builder, name: str, kind, rows, count: int, *args):
 
 
 def _make_columns(count: int):
-    """Two intrinsics, to load and to store eight rows of a float32 table with ``count`` columns."""
+    """Make intrinsics that load and store eight rows of a float32 table with ``count`` columns."""
     kind = ir.VectorType(ir.FloatType(), DOUBLES * count)
 
     @intrinsic
     def columns(typing_context, array, row, last):
-        """Rows ``row`` to ``row + 8`` of a table, a vector of doubles per column;
-        0 from ``last`` on.
+        """Load rows ``row`` to ``row + 8`` of a table as one vector of doubles per column; rows from
+        ``last`` on are 0.
 
         Args:
             typing_context: Numba's.
             array: float32 [rows, count].
             row: first row.
-            last: the row after the last one that is read.
+            last: end of the rows to read, excluded.
         """
 
         def emit(context, builder, sig, args):
@@ -206,13 +182,13 @@ def _make_columns(count: int):
 
     @intrinsic
     def store_columns(typing_context, array, row, last, values):
-        """Write a vector of doubles per column to rows ``row`` to ``row + 8`` of a table.
+        """Write one vector of doubles per column to rows ``row`` to ``row + 8`` of a table.
 
         Args:
             typing_context: Numba's.
             array: float32 [rows, count].
             row: first row.
-            last: the row after the last one that is written.
+            last: end of the rows to write, excluded.
             values: tuple of ``count`` vectors of eight doubles.
         """
 
@@ -234,8 +210,7 @@ def _make_columns(count: int):
 
 
 def _interleave(builder, columns: list):
-    """A long vector with the first lanes of all (eight-lane) columns, then their second lanes,
-    and so on."""
+    """Concatenate the first lanes of all (eight-lane) columns, then their second lanes, and so on."""
     lines = columns[0]
     for column in columns[1:]:
         # A shuffle needs two vectors of the same length.
@@ -253,7 +228,7 @@ def _interleave(builder, columns: list):
 
 @intrinsic
 def store_boxes(typing_context, array, row, values):
-    """Write four vectors of whole doubles to rows ``row`` to ``row + 8``.
+    """Write four vectors of integral doubles to rows ``row`` to ``row + 8`` of an integer table.
 
     Args:
         typing_context: Numba's.
@@ -273,8 +248,7 @@ def store_boxes(typing_context, array, row, values):
 
 
 def _transpose(builder, vectors: list):
-    """Transpose 16 vectors; with eight vectors,
-    transpose the two 8 x 8 matrices of their halves."""
+    """Transpose 16 vectors, or the two 8 x 8 matrices in the halves of eight vectors."""
     distance = len(vectors) // 2
     while distance > 0:
         low = [i if not i & distance else LANES + i - distance for i in range(LANES)]
@@ -291,13 +265,13 @@ def _transpose(builder, vectors: list):
 
 @intrinsic
 def gather_lines(typing_context, array, rows, index):
-    """16 rows of 16 floats, one vector per column.
+    """Load 16 rows of 16 floats as one vector per column.
 
     Args:
         typing_context: Numba's.
         array: float32 [rows, 16], aligned to a cache line.
-        rows: int64: which rows of ``array``.
-        index: the first of 16 places in ``rows``.
+        rows: indices of rows of ``array``, int64.
+        index: position in ``rows`` of the first of 16 indices.
     """
 
     def emit(context, builder, sig, args):
@@ -319,7 +293,7 @@ def store_lines(typing_context, array, row, values):
 
     Args:
         typing_context: Numba's.
-        array: float32 [rows, 16], aligned to a cache line; columns without a vector get 0.
+        array: float32 [rows, 16], aligned to a cache line; columns without a vector are set to 0.
         row: first row.
         values: tuple of at most 16 vectors of eight doubles.
     """
@@ -342,13 +316,13 @@ def store_lines(typing_context, array, row, values):
 
 @intrinsic
 def load_lines(typing_context, array, row, stride):
-    """The first 16 floats of eight rows, as 16 vectors of doubles.
+    """Load the first 16 floats of eight rows as 16 vectors of doubles, one per column.
 
     Args:
         typing_context: Numba's.
         array: float32, flat or a table, aligned to a cache line.
         row: first row.
-        stride: floats of a row, a multiple of 16.
+        stride: number of floats of a row, a multiple of 16.
     """
 
     def emit(context, builder, sig, args):

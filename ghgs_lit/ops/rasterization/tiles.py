@@ -1,7 +1,8 @@
-"""Parts of drawing a tile that the forward and the backward pass share. A tile is 16 x 16 pixels in
-16 blocks of 4 x 4; a block is one vector. Most splats are small (one for each input pixel) and fit
-a 4 x 4 block better than a row of 16. The planes of a tile are its colour channels, the sum of
-``w z`` and the sum of ``w``."""
+"""Rendering of a tile: what the forward and the backward pass share.
+
+A tile is 16 x 16 pixels in 16 blocks of 4 x 4; a block is one vector. Most splats are small (one per
+input pixel) and fit a 4 x 4 block better than a row of 16. The planes of a tile are its colour
+channels, the sum of ``w z`` and the sum of ``w``."""
 
 import numpy as np
 
@@ -19,7 +20,7 @@ LEAST_ALPHA = np.float32(1e-10)
 
 @helper
 def grid():
-    """Columns, then rows of a tile's pixels, block by block."""
+    """Columns, then rows of a tile's pixels, block by block, [2 PIXELS]."""
     pixels = simd.aligned(2 * layout.PIXELS)
     for pixel in range(layout.PIXELS):
         block = pixel // LANES
@@ -31,18 +32,18 @@ def grid():
 
 @helper
 def place(tile, tiles_x, tiles_y, height, width):
-    """Where a tile is.
+    """Locate a tile.
 
     Args:
         tile: index among the tiles of all views.
         tiles_x: number of tiles across a view.
         tiles_y: number of tiles down a view.
-        height: of the images, in pixels.
-        width: of the images, in pixels.
+        height: image height in pixels.
+        width: image width in pixels.
 
     Returns:
-        View, first column and row, rows and columns that lie in the image, and index of the first
-        pixel in a plane of the image.
+        View, first column, first row, number of rows and of columns inside the image, and index of the
+        first pixel in a plane of the image.
     """
     view = tile // (tiles_x * tiles_y)
     inner = tile % (tiles_x * tiles_y)
@@ -55,17 +56,17 @@ def place(tile, tiles_x, tiles_y, height, width):
 
 @helper
 def open_pixels(view, x0, y0, pixels, transmittance):
-    """Set the transmittance to 1 in pixels of the image, to 0 beyond.
+    """Set the transmittance to 1 in pixels of the image and to 0 outside.
 
     Args:
         view: a camera, [VIEW].
         x0: first column of the tile, in pixels.
         y0: first row of the tile, in pixels.
-        pixels: places of the tile's pixels, from :func:`grid`.
-        transmittance: gets [PIXELS], block by block.
+        pixels: coordinates of the tile's pixels, from :func:`grid`.
+        transmittance: written, [PIXELS], block by block.
 
     Returns:
-        The blocks with pixels of the image, as bits.
+        Bit mask of the blocks that have pixels in the image.
     """
     live = 0
     right = simd.full(np.float32(view[layout.RIGHT] - x0))
@@ -83,7 +84,7 @@ def open_pixels(view, x0, y0, pixels, transmittance):
 
 @helper
 def read_splat(record, x0, y0):
-    """A splat's numbers for a tile.
+    """Numbers of a splat relative to a tile.
 
     Args:
         record: one splat's record [RECORD], or a tuple with a vector for each of its numbers.
@@ -91,7 +92,8 @@ def read_splat(record, x0, y0):
         y0: first row of the tile, in pixels.
 
     Returns:
-        Vector from the splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff.
+        Vector from the splat's centre to the centre of the tile's first pixel (2), ``K`` (3), opacity
+        and cutoff.
     """
     x = x0 - record[layout.COLUMN]
     y = y0 - record[layout.ROW]
@@ -106,10 +108,10 @@ def color(records, s, colors, n, c, count):
     """A channel of a splat's colour.
 
     Args:
-        records: [splats, RECORD]; hold colours of at most ``layout.ROOM`` channels.
+        records: [splats, RECORD], which hold colours of at most ``layout.ROOM`` channels.
         s: index of the splat.
         colors: [N, C].
-        n: index of its Gaussian.
+        n: index of the splat's Gaussian.
         c: the channel.
         count: number of channels C, or a tuple of that length.
     """
@@ -120,13 +122,9 @@ def color(records, s, colors, n, c, count):
 
 @helper
 def prefetch(records, s, colors, n):
-    """Prefetch a splat: splats of a tile may lie anywhere in memory.
+    """Prefetch splat ``s`` of Gaussian ``n``, since the splats of a tile are scattered in memory.
 
-    Args:
-        records: [splats, RECORD].
-        s: index of the splat.
-        colors: [N, C].
-        n: index of its Gaussian.
+    ``records`` is [splats, RECORD], ``colors`` [N, C].
     """
     memory.prefetch(records, s * layout.RECORD)
     if colors.shape[1] > layout.ROOM:
@@ -147,9 +145,9 @@ def whiten(numbers, dx, dy):
 
 @helper
 def blend(numbers, p, q, before, alpha_max, stop):
-    """Blend a splat over a block of pixels.
+    """Blend a splat into a block of pixels.
 
-    Masked lanes hold zeros, so that vectors are stored whole: a masked store could not be forwarded
+    Masked lanes hold zeros, so that whole vectors are stored: a masked store could not be forwarded
     to the next splat's load.
 
     Args:
@@ -158,16 +156,17 @@ def blend(numbers, p, q, before, alpha_max, stop):
         q: second whitened coordinate of the pixels.
         before: transmittance in front of the splat.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel ends.
+        stop: transmittance at which a pixel terminates.
 
     Returns:
-        The unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and
-        that stay open; and the transmittance behind it. Where that would fall to ``stop``, the
-        splat is left out and the transmittance becomes 0, which excludes all splats behind.
+        The unclamped alpha; the clamped alpha; the masks of lanes that the splat reaches, where it is
+        visible, and where the pixel is not yet terminated; and the transmittance behind the splat.
+        Where that would fall to ``stop``, the splat is skipped and the transmittance becomes 0, which
+        excludes all splats behind.
     """
     squared = simd.fma(p, p, q * q)
     reached = squared <= numbers[6]
-    # Lanes out of reach are clamped to the cutoff: denormal numbers would be slow.
+    # Clamp lanes out of reach to the cutoff: denormal numbers would be slow.
     raw = numbers[5] * simd.exp2_minus(simd.minimum(squared, numbers[6]))
     alpha = simd.select(reached, simd.minimum(raw, alpha_max), ZERO)
     behind = before - before * alpha
