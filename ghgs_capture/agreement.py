@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
@@ -19,6 +20,7 @@ from ghgs_capture.capture import Capture
 from ghgs_capture.crops import SHARE, Photograph
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import signed_distance
+from ghgs_lit.geometry.projection import meeting_point
 from ghgs_lit.refinement.coherence import contradiction
 from ghgs_lit.types import Batch
 
@@ -146,16 +148,15 @@ class Agreement:
 
 def _middle(photographs: tuple[Photograph, ...]) -> Float[np.ndarray, " 3"]:
     """The point nearest to the rays through the centres of all masks."""
-    centers, across = [], []
+    centers, rays = [], []
     for photograph in photographs:
         middle = [(first + end) / 2 for first, end in reversed(photograph.extents)]
         rotation = photograph.extrinsics[:3, :3]
         ray = rotation.T @ np.linalg.solve(photograph.intrinsics, [*middle, 1.0])
-        ray /= np.linalg.norm(ray)
+        rays.append(ray / np.linalg.norm(ray))
         centers.append(-rotation.T @ photograph.extrinsics[:3, 3])
-        across.append(np.eye(3) - np.outer(ray, ray))
-    right = sum(matrix @ center for matrix, center in zip(across, centers, strict=True))
-    return np.linalg.lstsq(sum(across), right, rcond=None)[0]
+    lines = (torch.from_numpy(np.stack(each)) for each in (centers, rays))
+    return meeting_point(*lines).numpy()
 
 
 def _looked_up(

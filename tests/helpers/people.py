@@ -44,7 +44,7 @@ def box_person(name: str = "box", color=(200, 90, 30), extents=(0.5, 1.7, 0.3)) 
     return Person(name, (part,), vertices.copy())
 
 
-def write_obj_scan(folder: Path, name: str, color=(200, 90, 30), textured: bool = True) -> Path:
+def write_obj_scan(folder: Path, name: str, color=(200, 90, 30)) -> Path:
     """Write a scan in the format of THuman2.0, with all vertices as body vertices."""
     person = box_person(name, color, (0.4 + 0.01 * len(name), 1.5, 0.3))
     part = person.parts[0]
@@ -55,9 +55,8 @@ def write_obj_scan(folder: Path, name: str, color=(200, 90, 30), textured: bool 
     lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in part.faces]
     path = folder / name / f"{name}.obj"
     path.write_text("\n".join(lines))
-    if textured:
-        (folder / name / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
-        Image.fromarray(part.texture).save(folder / name / "material0.jpeg", quality=100, subsampling=0)
+    (folder / name / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
+    Image.fromarray(part.texture).save(folder / name / "material0.jpeg", quality=100, subsampling=0)
     np.save(folder / name / "body_vertices.npy", (part.vertices + np.float32([1, 2, 3])).astype(np.float16))
     return path
 
