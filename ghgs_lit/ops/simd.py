@@ -160,7 +160,7 @@ def full(typing_context, value):
 
 @intrinsic
 def fma(typing_context, a, b, c):
-    """``a * b + c``, fused where the machine has an instruction for it.
+    """Compute ``a * b + c``, fused where the processor has an instruction for it.
 
     Args:
         typing_context: Numba's.
@@ -218,7 +218,7 @@ def select(typing_context, where, a, b):
 
 @intrinsic
 def bits(typing_context, where):
-    """The mask as an integer, lane 0 in bit 0."""
+    """Convert a mask to an integer, lane 0 in bit 0."""
 
     def emit(context, builder, sig, args):
         return builder.zext(builder.bitcast(args[0], ir.IntType(where.count)), I64)
@@ -228,7 +228,7 @@ def bits(typing_context, where):
 
 @intrinsic
 def mask(typing_context, bits):
-    """The mask of eight lanes given by an integer, lane 0 in bit 0."""
+    """Convert an integer to a mask of eight lanes, lane 0 in bit 0."""
 
     def emit(context, builder, sig, args):
         return builder.bitcast(builder.trunc(args[0], ir.IntType(DOUBLES)), mask8.llvm)
@@ -238,8 +238,7 @@ def mask(typing_context, bits):
 
 @intrinsic
 def lane_sum(typing_context, x):
-    """Sum of all lanes of floats, by adding the upper half to the lower half until one
-    lane is left."""
+    """Sum of all lanes of floats, adding the upper half to the lower half until one lane is left."""
 
     def emit(context, builder, sig, args):
         total = args[0]
@@ -284,7 +283,7 @@ EXP2_LIMIT = np.float32(126)
 
 @intrinsic
 def exp2_minus(typing_context, x):
-    """``2^-x`` of floats for ``0 <= x <= EXP2_LIMIT``, within 2 ulp."""
+    """Compute ``2^-x`` of floats for ``0 <= x <= EXP2_LIMIT``, within 2 ulp."""
 
     def emit(context, builder, sig, args):
         whole = call(builder, "rint", floats, args[0])
@@ -306,7 +305,7 @@ _TWICE = np.float32(2 * math.log2(math.e))
 
 @helper
 def tanh(x):
-    """The hyperbolic tangent of floats, within 1e-7; NaN stays."""
+    """Hyperbolic tangent of floats, within 1e-7; NaN stays NaN."""
     distance = maximum(x, _ZERO - x)
     shrunk = exp2_minus(minimum(full(EXP2_LIMIT), distance * _TWICE))
     size = (_ONE - shrunk) / (_ONE + shrunk)
@@ -316,7 +315,7 @@ def tanh(x):
 # log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2,
 # sqrt 2).
 _LOG2 = [2 / math.log(2) / k for k in range(1, 19, 2)]
-# Subtracted from the bits of x, so that the remaining mantissa lies in [1/sqrt 2, sqrt 2).
+# Subtracted from the bits of x, so that the mantissa lies in [1/sqrt 2, sqrt 2).
 _ROOT_HALF = int(np.float64(math.sqrt(0.5)).view(np.int64))
 
 
@@ -343,7 +342,7 @@ def log2(typing_context, x):
 
 
 def length(values):
-    """The length of a tuple, as a constant of the compiler; an integer is returned unchanged."""
+    """Length of a tuple as a compile-time constant; an integer is returned unchanged."""
 
 
 @overload(length)
@@ -355,7 +354,7 @@ def _length(values):
 
 
 def aligned_floats(count):
-    """``count`` uninitialised floats that start on a cache line."""
+    """Allocate ``count`` uninitialised floats aligned to a cache line."""
     buffer = np.empty(count + LANES, np.float32)
     skip = (-(buffer.ctypes.data // 4)) % LANES
     return buffer[skip : skip + count]

@@ -1,5 +1,6 @@
-"""What kernels in Triton share: functions of tiles, which hold one number for each row. Only
-kernels import it, since no other PyTorch than CUDA's comes with Triton."""
+"""Functions shared by the Triton kernels; a tile holds one number per row.
+
+Import it only from kernels: Triton comes with PyTorch for CUDA only."""
 
 from typing import Any
 
@@ -12,13 +13,13 @@ ROWS = 128
 
 
 def start(kernel: Any, count: int, *arguments: Any, **flags: bool) -> None:
-    """Start a kernel with contiguous tensors: ``kernel(count, *arguments, **flags, ROWS=ROWS)``.
+    """Launch ``kernel(count, *arguments, **flags, ROWS=ROWS)`` with contiguous tensors.
 
     Args:
-        kernel: a function of Triton.
-        count: number of rows; with 0 nothing is started.
-        arguments: tensors and numbers.
-        flags: constants of the compiler.
+        kernel: a ``triton.jit`` function.
+        count: number of rows; nothing is launched for 0.
+        arguments: tensors and numbers; tensors are made contiguous.
+        flags: compile-time constants.
     """
     if count > 0:
         read = [x.contiguous() if isinstance(x, Tensor) else x for x in arguments]
@@ -27,14 +28,11 @@ def start(kernel: Any, count: int, *arguments: Any, **flags: bool) -> None:
 
 @triton.jit
 def rows_of(count, ROWS: tl.constexpr):
-    """Rows of this program; beyond the last one it is repeated, so that no row need be masked.
+    """Indices of the rows of this program, int64 [ROWS]; the last row repeats, so that no mask is needed.
 
     Args:
         count: number of rows.
-        ROWS: rows of a program.
-
-    Returns:
-        Numbers of rows, int64 [ROWS].
+        ROWS: rows per program.
     """
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     return tl.minimum(i, count - 1)
@@ -42,29 +40,13 @@ def rows_of(count, ROWS: tl.constexpr):
 
 @triton.jit
 def load3(table, i):
-    """Numbers of rows of a table of three columns.
-
-    Args:
-        table: pointer to a contiguous table [rows, 3].
-        i: rows, [ROWS].
-
-    Returns:
-        The columns, [ROWS] each.
-    """
+    """Load rows ``i`` [ROWS] of a contiguous table [rows, 3] as three columns, [ROWS] each."""
     return tl.load(table + 3 * i), tl.load(table + 3 * i + 1), tl.load(table + 3 * i + 2)
 
 
 @triton.jit
 def store3(table, i, x, y, z):
-    """Write rows of a table of three columns.
-
-    Args:
-        table: pointer to a contiguous table [rows, 3].
-        i: rows, [ROWS].
-        x: first column, [ROWS].
-        y: second column, [ROWS].
-        z: third column, [ROWS].
-    """
+    """Write three columns, [ROWS] each, to rows ``i`` [ROWS] of a contiguous table [rows, 3]."""
     tl.store(table + 3 * i, x)
     tl.store(table + 3 * i + 1, y)
     tl.store(table + 3 * i + 2, z)
@@ -72,31 +54,14 @@ def store3(table, i, x, y, z):
 
 @triton.jit
 def load4(table, i):
-    """Numbers of rows of a table of four columns.
-
-    Args:
-        table: pointer to a contiguous table [rows, 4].
-        i: rows, [ROWS].
-
-    Returns:
-        The columns, [ROWS] each.
-    """
+    """Load rows ``i`` [ROWS] of a contiguous table [rows, 4] as four columns, [ROWS] each."""
     at = table + 4 * i
     return tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
 
 
 @triton.jit
 def store4(table, i, w, x, y, z):
-    """Write rows of a table of four columns.
-
-    Args:
-        table: pointer to a contiguous table [rows, 4].
-        i: rows, [ROWS].
-        w: first column, [ROWS].
-        x: second column, [ROWS].
-        y: third column, [ROWS].
-        z: fourth column, [ROWS].
-    """
+    """Write four columns, [ROWS] each, to rows ``i`` [ROWS] of a contiguous table [rows, 4]."""
     tl.store(table + 4 * i, w)
     tl.store(table + 4 * i + 1, x)
     tl.store(table + 4 * i + 2, y)
@@ -105,19 +70,13 @@ def store4(table, i, w, x, y, z):
 
 @triton.jit
 def clamp(x, low, high):
-    """``x`` between two limits; NaN stays.
-
-    Args:
-        x: [ROWS].
-        low: lower limit.
-        high: upper limit.
-    """
+    """Clamp ``x`` [ROWS] to two limits; NaN stays NaN."""
     return tl.where(x > high, high, tl.where(x < low, low, x))
 
 
 @triton.jit
 def tanh(x):
-    """The hyperbolic tangent. Near 0 a series: the quotient loses digits there."""
+    """Hyperbolic tangent; near 0 by a series, since the quotient loses digits there."""
     shrunk = tl.exp(-2 * tl.abs(x))
     size = (1 - shrunk) / (1 + shrunk)
     squared = x * x
@@ -127,17 +86,17 @@ def tanh(x):
 
 @triton.jit
 def to_camera(extrinsics, view, x, y, z):
-    """World points in axes of their cameras.
+    """Transform world points to the axes of their cameras.
 
     Args:
         extrinsics: pointer to world-to-camera matrices [V, 4, 4].
-        view: camera of each point, [ROWS].
-        x: of the points in the world, [ROWS].
-        y: of the points in the world, [ROWS].
-        z: of the points in the world, [ROWS].
+        view: index of each point's camera, [ROWS].
+        x: world coordinates, [ROWS].
+        y: world coordinates, [ROWS].
+        z: world coordinates, [ROWS].
 
     Returns:
-        Coordinates to the right, down and ahead of the camera, [ROWS] each.
+        Camera coordinates to the right, down and forward, [ROWS] each.
     """
     a, b, c, shift = load4(extrinsics, 4 * view)
     right = a * x + b * y + c * z + shift
@@ -149,15 +108,15 @@ def to_camera(extrinsics, view, x, y, z):
 
 @triton.jit
 def cells(place, size):
-    """The two cells around a place along an axis of a map, and their weights.
+    """Find the two cells around a position along an axis of a map, for linear interpolation.
 
     Args:
-        place: in cells from the map's border, centres of cells at +0.5, [ROWS].
-        size: cells along the axis.
+        place: position in cells from the map's border, with cell centres at +0.5, [ROWS].
+        size: number of cells along the axis.
 
     Returns:
-        Indices of both cells, clamped to the map, and their weights: 0 beyond its border. NaN, and
-        places far away, are beyond it.
+        Indices of both cells, clamped to the map, and their weights, which are 0 outside the map, for
+        NaN and for distant positions.
     """
     place = tl.where(place > -2, tl.where(place < size + 2, place, size + 2), -2) - 0.5
     first = tl.floor(place)
@@ -172,12 +131,12 @@ def cells(place, size):
 
 @triton.jit
 def between(plane, top, bottom, left, right, above, below, before, after):
-    """Bilinear value of a map between two rows and two columns.
+    """Interpolate a map bilinearly between two rows and two columns.
 
     Args:
         plane: pointer to one channel of a map.
-        top: where the upper row begins in the plane.
-        bottom: where the lower row begins in the plane.
+        top: offset of the upper row in the plane.
+        bottom: offset of the lower row in the plane.
         left: the left column.
         right: the right column.
         above: weight of the upper row.

@@ -1,4 +1,4 @@
-"""Activations of the raw channels of heads, axes of surfaces, and Gaussians from both."""
+"""Activations of the raw output channels of heads, surface axes, and the Gaussians made from both."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,14 +21,7 @@ class _Saturate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x: Tensor, limit: float, symmetric: bool) -> Tensor:
-        """The activation of ``x`` within its limit.
-
-        Args:
-            ctx: of autograd.
-            x: raw values.
-            limit: largest argument.
-            symmetric: tanh instead of sigmoid.
-        """
+        """Apply the activation to ``x`` clamped to +-``limit``; ``symmetric`` selects tanh."""
         ctx.save_for_backward(x)
         ctx.limit = limit
         ctx.symmetric = symmetric
@@ -50,48 +43,44 @@ class _Saturate(torch.autograd.Function):
         return torch.where(leads_back, slope * own, 0), None, None
 
 
-#: Largest arguments of the activations; sigmoid and tanh have slopes of 4.5e-5 and 1.8e-4 there.
+#: Largest arguments of the activations, at which sigmoid and tanh have slopes of 4.5e-5 and 1.8e-4.
 SIGMOID_LIMIT = 10.0
 TANH_LIMIT = 5.0
 EXP_LIMIT = 80.0
 
 
 def bounded_sigmoid(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The sigmoid of ``x`` clamped to +-10; beyond,
-    only gradients that lead back into the limits remain.
+    """Sigmoid of ``x`` clamped to +-10; beyond, only gradients that lead back into the limits remain.
 
-    In float32 a plain sigmoid is exactly 1 from 17 on, without a gradient: one step that is too
-    large ends the training of a head.
+    In float32 a plain sigmoid is exactly 1 from 17 on and has no gradient, so that one step that is
+    too large would end the training of a head.
     """
     return _Saturate.apply(x, SIGMOID_LIMIT, False)
 
 
 def bounded_tanh(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The hyperbolic tangent of ``x`` clamped to +-5,
-    with gradients as of :func:`bounded_sigmoid`."""
+    """Hyperbolic tangent of ``x`` clamped to +-5, with gradients as in :func:`bounded_sigmoid`."""
     return _Saturate.apply(x, TANH_LIMIT, True)
 
 
 def confidence_of(raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """A confidence of at least 1, as in published heads (VGGT),
-    finite for any raw value but NaN."""
+    """Confidence ``1 + exp(raw)``, as in VGGT's heads; finite for any raw value but NaN."""
     return 1 + raw.clamp(max=EXP_LIMIT).exp()
 
 
-#: The gradient of shorter quaternions is that of this length: it would grow without bound near 0.
+#: Shorter quaternions get the gradient of this length: it would grow without bound near 0.
 SHORTEST = 0.1
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class Constants(NamedTuple):
-    """Numbers of :func:`footprint_attributes`.
-    Lengths are in footprints, except those of offsets."""
+    """Constants of :func:`footprint_attributes`; lengths are in footprints, those of offsets in metres."""
 
     offset_limit: float
-    """Largest offset along each axis in metres; 0: none."""
+    """Largest offset along each axis in metres; 0: no limit."""
     offset_unit: float
-    """Offset in metres for a raw value of 1 where there is no limit."""
+    """Offset in metres for a raw value of 1 if there is no limit."""
     inward: float
     scale_floor: float
     scale_range: float
@@ -103,7 +92,7 @@ class Constants(NamedTuple):
     opacity_floor: float
     opacity_bias: float
     color_limit: float
-    """Largest change of a colour from its pixel's."""
+    """Largest difference of a colour from the colour of its pixel."""
 
 
 def footprint_attributes(
@@ -114,15 +103,15 @@ def footprint_attributes(
     footprint: Float[Tensor, " N"],
     constants: Constants,
 ) -> Attributes:
-    """Offsets, scales, quaternions and opacities in units of a pixel's footprint.
+    """Activate offsets, scales, rotations and opacities, with scales relative to a pixel's footprint.
 
     Args:
-        offset: raw, as are the next three.
-        scale: raw.
-        rotation: raw; 0 is no rotation.
-        opacity: raw.
-        footprint: side of a pixel at each Gaussian's depth, in metres.
-        constants: of ``FootprintAttributes``.
+        offset: raw values.
+        scale: raw values.
+        rotation: raw values; 0 is no rotation.
+        opacity: raw values.
+        footprint: side of a pixel at the depth of each Gaussian, in metres.
+        constants: constants of ``FootprintAttributes``.
 
     Returns:
         Offsets and scales in metres, unit quaternions, and opacities from ``opacity_floor`` to 1.
@@ -141,8 +130,8 @@ def footprint_attributes(
     )
 
 
-#: A neighbour counts fully if its depth differs by less than the first number of pixel footprints,
-#: and not at all (another surface) from the second on.
+#: A neighbour has weight 1 if its depth differs by less than ``SAME`` pixel footprints, and weight 0
+#: (another surface) from ``OTHER`` on.
 SAME = 4.0
 OTHER = 8.0
 
@@ -151,18 +140,18 @@ OTHER = 8.0
 def surface_axes(
     maps: DepthMaps, cameras: Cameras, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"]
 ) -> Float[Tensor, "N 4"]:
-    """Unit quaternions from axes of the surface to the world, without a gradient.
+    """Unit quaternions from surface axes to the world, without a gradient.
 
-    The third axis is the normal away from the camera; the others are the camera's right and down,
-    turned by the smallest rotation from its forward axis to the normal. Normals come from depth
-    differences to neighbouring valid pixels on the same surface; without any along an axis of the
-    image, its slope is 0.
+    The third axis is the normal that points away from the camera; the others are the camera's right
+    and down axes, turned by the smallest rotation from its forward axis to the normal. Normals come
+    from depth differences to neighbouring valid pixels of the same surface; along an image axis
+    without such neighbours the slope is 0.
 
     Args:
-        maps: depths in metres, and which of them are valid.
-        cameras: [B, V], of the maps.
-        image: numbers of the images (``b * V + v``).
-        pixel: row-major indices of their pixels.
+        maps: depths in metres with their validity.
+        cameras: cameras of the maps, [B, V].
+        image: index of each Gaussian's image (``b * V + v``).
+        pixel: row-major index of its pixel.
     """
     height, width = maps.depth.shape[-2:]
     depth = at_least_float32(maps.depth)
@@ -171,11 +160,10 @@ def surface_axes(
     fx, skew, cx, fy, cy = (intrinsics[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     row = pixel // width
     column = pixel % width
-    # Invalid pixels and those beyond the border are infinitely far away.
+    # Invalid pixels and pixels outside the image are infinitely far away.
     around = F.pad(depth.masked_fill(~maps.valid, torch.inf), (1, 1, 1, 1), value=torch.inf).flatten()
     place = (image * (height + 2) + row + 1) * (width + 2) + column + 1
-    # Of the neighbours to the right, below, to the left and above: how much deeper,
-    # and a weight from 0 to 1.
+    # Depth difference and weight in [0, 1] of the neighbours to the right, below, to the left and above.
     deeper = around[torch.stack([place + step for step in (1, width + 2, -1, -width - 2)])] - own
     near = ((OTHER - deeper.abs() / (own / fx)) / (OTHER - SAME)).clamp(0, 1)
     after, before = (near * torch.where(near > 0, deeper, 0)).split(2)
@@ -204,20 +192,21 @@ def activated(
     color_limit: float,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gaussians from raw attributes.
+    """Make Gaussians from raw attributes.
 
     Args:
-        raw: offsets, scales, rotations, opacities and colours (or None) before activations.
-        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
-        pixel: row-major indices of their pixels.
+        raw: offsets, scales, rotations, opacities and colours (or None) before activation.
+        image: index of each Gaussian's image (``b * V + v``).
+        pixel: row-major index of its pixel.
         maps: depths in metres.
         points: world points of pixels, in metres.
         photo: colours of pixels, in [0, 1].
-        share: factors of opacities; None: 1.
-        cameras: of the images.
-        attributes: offsets, scales, quaternions and opacities of raw ones and of footprints.
-        color_limit: largest change of a colour from its pixel's.
-        on_surface: ``raw`` is in axes of the surface.
+        share: factors of the opacities; None: 1.
+        cameras: cameras of the images.
+        attributes: maps raw offsets, scales, rotations, opacities and the footprints in metres to
+            offsets, scales, quaternions and opacities.
+        color_limit: largest difference of a colour from the colour of its pixel.
+        on_surface: ``raw`` refers to surface axes (:func:`surface_axes`).
 
     Returns:
         Means in metres [N, 3], quaternions [N, 4], scales in metres [N, 3],
@@ -226,7 +215,7 @@ def activated(
     *numbers, color = raw
     focal = focal_lengths(cameras).prod(-1).sqrt().flatten()[image]
     depth = maps.depth.flatten(0, 1).flatten(1)[image, pixel]
-    # No gradient: a splat that is too large must not move nearer to become smaller.
+    # Detached: a splat that is too large must not move nearer to become smaller.
     footprint = depth.detach() / focal
     offset, scales, quaternions, opacities = attributes(*numbers, footprint)
     if on_surface:
@@ -254,22 +243,25 @@ def footprint_gaussians(
     constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """:func:`activated` with :func:`footprint_attributes`; differentiable in all but cameras and depths.
+    """Make Gaussians from raw attributes with :func:`footprint_attributes`; see :func:`activated`.
+
+    Differentiable with respect to all inputs but cameras and depths.
 
     Args:
-        raw: as of :func:`activated`, as are all but ``constants``.
-        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
-        pixel: row-major indices of their pixels.
+        raw: offsets, scales, rotations, opacities and colours (or None) before activation.
+        image: index of each Gaussian's image (``b * V + v``).
+        pixel: row-major index of its pixel.
         maps: depths in metres.
         points: world points of pixels, in metres.
         photo: colours of pixels, in [0, 1].
-        share: factors of opacities; None: 1.
-        cameras: of the images.
-        constants: of ``FootprintAttributes``, with the limit of colours.
-        on_surface: ``raw`` is in axes of the surface.
+        share: factors of the opacities; None: 1.
+        cameras: cameras of the images.
+        constants: constants of ``FootprintAttributes``, with the limit of colours.
+        on_surface: ``raw`` refers to surface axes (:func:`surface_axes`).
 
     Returns:
-        As of :func:`activated`.
+        Means in metres [N, 3], quaternions [N, 4], scales in metres [N, 3],
+        opacities [N] and colours [N, 3].
     """
     seen = (image, pixel, maps.depth, maps.valid, points, photo, share)
     return _activate(*raw, *seen, cameras.intrinsics, cameras.extrinsics, list(constants), on_surface)
@@ -280,15 +272,14 @@ _INPUTS = (
     "Tensor pixel, Tensor depth, Tensor valid, Tensor points, Tensor photo, Tensor? share, "
     "Tensor intrinsics, Tensor extrinsics, float[] constants, bool on_surface"
 )
-#: Places of the inputs that have a gradient, and of depths and extrinsics, on which nothing
-#: depends differentiably.
+#: Positions of the inputs that have a gradient, and of depths and extrinsics, whose gradient is 0.
 _RAW = (0, 1, 2, 3, 4)
 _POINTS = 9
 _FIXED = (7, 13)
 
 
 def _plain(*inputs: Any) -> tuple[Tensor, ...]:
-    """:func:`footprint_gaussians` in plain PyTorch; inputs in the order of ``_INPUTS``."""
+    """:func:`footprint_gaussians` in plain PyTorch, with inputs in the order of ``_INPUTS``."""
     *raw, image, pixel, depth, valid, points, photo, share = inputs[:12]
     intrinsics, extrinsics, constants, on_surface = inputs[12:]
     maps = DepthMaps(depth, valid, depth)
@@ -300,10 +291,8 @@ def _plain(*inputs: Any) -> tuple[Tensor, ...]:
 
 
 def _plain_back(*inputs: Any) -> list[Tensor]:
-    """Gradients of raw values and points in plain PyTorch.
-
-    Inputs are those of :func:`_plain` and gradients of its results.
-    """
+    """Gradients of raw values and points in plain PyTorch, from the inputs of :func:`_plain` and the
+    gradients of its results."""
     *inputs, slopes = inputs
     places = [place for place in (*_RAW, _POINTS) if inputs[place] is not None]
     for place in places:
@@ -332,7 +321,7 @@ _activate_back = Operator(
 def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
     *tensors, ctx.constants, ctx.on_surface = inputs
     ctx.save_for_backward(*tensors)
-    if tensors[4] is None:  # colours are those of the photographs
+    if tensors[4] is None:  # colours are copied from the images
         ctx.mark_non_differentiable(output[4])
 
 

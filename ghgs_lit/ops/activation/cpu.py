@@ -1,6 +1,6 @@
-"""The kernel of the Gaussian head, without a gradient:
-:func:`ghgs_lit.ops.activation.footprint_gaussians` for 16 Gaussians of one image at once. A line
-of ``values`` holds one number of each."""
+"""CPU kernel of :func:`ghgs_lit.ops.activation.footprint_gaussians`, without a gradient.
+
+It processes 16 Gaussians of one image at once; a line of ``values`` holds one number of each."""
 
 import math
 from itertools import pairwise
@@ -23,7 +23,7 @@ TANH = np.float32(TANH_LIMIT)
 FAR = np.float32(OTHER)
 RANGE = np.float32(OTHER - SAME)
 
-# Lines: raw values, values at the pixel, and depths to the right, to the left, below and above it.
+# Lines: raw values, values at the pixel, and the depths to its right, to its left, below and above.
 OFFSET = 0
 SCALE = 3
 ROTATION = 6
@@ -68,14 +68,8 @@ def _exp(x):
 
 @helper
 def _unit(w, x, y, z):
-    """Quaternions divided by their length; 0 stays 0. The largest number is divided out first.
-
-    Args:
-        w: real part of 16 quaternions.
-        x: second part, as are the next two.
-        y: third part.
-        z: fourth part.
-    """
+    """Normalise 16 quaternions, where 0 stays 0; the largest number is divided out first against overflow
+    and underflow."""
     largest = simd.maximum(simd.maximum(w, ZERO - w), simd.maximum(x, ZERO - x))
     largest = simd.maximum(largest, simd.maximum(simd.maximum(y, ZERO - y), simd.maximum(z, ZERO - z)))
     is_zero = largest == ZERO
@@ -91,7 +85,7 @@ def _unit(w, x, y, z):
 
 @helper
 def _multiply(p, q):
-    """The product of two quaternions."""
+    """Product of two quaternions."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -107,7 +101,7 @@ def _cross(a, b):
 
 @helper
 def _rotate(q, v):
-    """The vector ``v`` rotated by the unit quaternion ``q``."""
+    """Rotate the vector ``v`` by the unit quaternion ``q``."""
     axis = q[1], q[2], q[3]
     x, y, z = _cross(axis, v)
     twice = x + x, y + y, z + z
@@ -117,15 +111,8 @@ def _rotate(q, v):
 
 @helper
 def _slope(values, line, own, footprint):
-    """Relative change of depth along an axis, from the pixels before and after;
-    see ``surface_axes``.
-
-    Args:
-        values: lines of the Gaussians.
-        line: that of the depths after; depths before are in the next one.
-        own: depths of the Gaussians, in metres.
-        footprint: sides of their pixels there, in metres.
-    """
+    """Relative depth change per pixel along an axis (see ``surface_axes``); the depths of the next pixels
+    are in ``line``, those of the previous ones in the line after it."""
     after = _line(values, line) - own
     before = _line(values, line + 1) - own
     near_after = simd.minimum(ONE, (FAR - simd.maximum(after, ZERO - after) / footprint) / RANGE)
@@ -139,15 +126,15 @@ def _slope(values, line, own, footprint):
 
 @helper
 def _axes(values, camera, turn, row, column, own):
-    """Quaternions from axes of the surface to the world; see ``surface_axes``.
+    """Quaternions from surface axes to the world; see ``surface_axes``.
 
     Args:
         values: lines of the Gaussians.
         camera: intrinsics [3, 3] in pixels.
-        turn: quaternion from the camera's axes to the world.
-        row: of the pixels.
-        column: of the pixels.
-        own: depths of the Gaussians, in metres.
+        turn: quaternion from camera axes to the world.
+        row: rows of the pixels.
+        column: columns of the pixels.
+        own: depths of the Gaussians in metres.
     """
     footprint = own / camera[0, 0]
     right = _slope(values, AROUND, own, footprint)
@@ -165,25 +152,8 @@ def _read(
     offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, image, start, last,
     values,
 ):  # fmt: skip
-    """Fill lines with 16 Gaussians; the last one is repeated.
-
-    Args:
-        offset: [N, 3], raw, as are the next four.
-        scale: [N, 3].
-        rotation: [N, 4].
-        opacity: [N].
-        color: [N, 3]; without rows: 0.
-        pixel: [N], row-major indices of their pixels.
-        depth: [images, H, W] in metres.
-        valid: [images, H, W], which depths are.
-        points: [images, H, W, 3], world points in metres.
-        photo: [images, 3, H, W], colours.
-        share: [images, H, W], factors of opacities; without rows: 1.
-        image: number of the image that they belong to.
-        start: the first Gaussian.
-        last: end of the Gaussians of this task, excluded.
-        values: ``LINES`` lines, written.
-    """
+    """Fill ``values``, ``LINES`` lines, with 16 Gaussians, padded with the one before ``last``; inputs as
+    in :func:`activate_rows`."""
     height = depth.shape[1]
     width = depth.shape[2]
     for lane in range(LANES):
@@ -216,28 +186,28 @@ def activate_rows(
     """Write Gaussians of one image; see :func:`activate`.
 
     Args:
-        offset: [N, 3], raw, as are the next four.
-        scale: [N, 3].
-        rotation: [N, 4].
-        opacity: [N].
-        color: [N, 3]; without rows: 0.
-        pixel: [N], row-major indices of their pixels.
-        depth: [images, H, W] in metres.
-        valid: [images, H, W], which depths are.
-        points: [images, H, W, 3], world points in metres.
-        photo: [images, 3, H, W], colours.
-        share: [images, H, W], factors of opacities; without rows: 1.
-        intrinsics: [images, 3, 3] in pixels.
-        turns: [images, 4], quaternions from the cameras' axes to the world.
-        constants: numbers of :class:`ghgs_lit.ops.activation.Constants`.
-        on_surface: raw values are in axes of the surface.
-        means: [N, 3] in metres; written, as are the next four.
-        quaternions: [N, 4].
-        scales: [N, 3] in metres.
-        opacities: [N].
-        colors: [N, 3].
-        image: number of the image.
-        first: the first Gaussian.
+        offset: raw [N, 3].
+        scale: raw [N, 3].
+        rotation: raw [N, 4].
+        opacity: raw [N].
+        color: raw [N, 3]; without rows: 0.
+        pixel: row-major index of each Gaussian's pixel [N].
+        depth: in metres [images, H, W].
+        valid: whether depths are valid [images, H, W].
+        points: world points in metres [images, H, W, 3].
+        photo: colours [images, 3, H, W].
+        share: factors of the opacities [images, H, W]; without rows: 1.
+        intrinsics: in pixels [images, 3, 3].
+        turns: quaternions from camera axes to the world [images, 4].
+        constants: fields of :class:`ghgs_lit.ops.activation.Constants`.
+        on_surface: raw values refer to surface axes.
+        means: written, in metres [N, 3].
+        quaternions: written [N, 4].
+        scales: written, in metres [N, 3].
+        opacities: written [N].
+        colors: written [N, 3].
+        image: index of the image.
+        first: first Gaussian.
         last: end of the Gaussians, excluded.
     """
     limit, unit, inward, floor, span, across, thickness, least, bias, change = constants
@@ -298,7 +268,7 @@ _TASK = 1024
 
 
 def activate(*inputs: Any) -> tuple[Tensor, ...]:
-    """The operator of :mod:`ghgs_lit.ops.activation`; images and their pixels ascend."""
+    """Kernel of the operator of :mod:`ghgs_lit.ops.activation`; image indices must be ascending."""
     *raw, color, image, pixel, depth, valid, points, photo, share = inputs[:12]
     intrinsics, extrinsics, constants, on_surface = inputs[12:]
     color = raw[0].new_empty(0, 3) if color is None else color

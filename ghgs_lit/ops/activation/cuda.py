@@ -1,8 +1,7 @@
-"""Activations of Gaussians and their gradients for a GPU, in Triton:
-``ROWS`` Gaussians in a program.
+"""Triton kernels of the activations of Gaussians and of their gradients, ``ROWS`` Gaussians per program.
 
-Formulas are those of :mod:`ghgs_lit.ops.activation`. A
-Gaussian reads at most 45 numbers, so that its gradient computes again what it needs."""
+The formulas are in :mod:`ghgs_lit.ops.activation`. A Gaussian reads at most 45 numbers, so that the
+backward pass recomputes intermediate values instead of storing them."""
 
 import triton
 import triton.language as tl
@@ -20,8 +19,7 @@ RANGE = tl.constexpr(activation.OTHER - activation.SAME)
 
 @triton.jit
 def unit_quaternion(w, x, y, z):
-    """Quaternions divided by their length, and the length; 0 stays 0. The largest number is divided
-    out first."""
+    """Normalised quaternions and their length; 0 stays 0. The largest number is divided out first."""
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     scale = 1 / tl.where(largest == 0, 1.0, largest)
     w = w * scale
@@ -36,7 +34,7 @@ def unit_quaternion(w, x, y, z):
 
 @triton.jit
 def product(a, b, c, d, w, x, y, z):
-    """The product of two quaternions."""
+    """Product of two quaternions."""
     return (
         a * w - b * x - c * y - d * z,
         a * x + b * w + c * z - d * y,
@@ -47,7 +45,7 @@ def product(a, b, c, d, w, x, y, z):
 
 @triton.jit
 def rotated(w, a, b, c, x, y, z):
-    """The vector (x, y, z) rotated by the unit quaternion (w, a, b, c)."""
+    """Rotate the vector (x, y, z) by the unit quaternion (w, a, b, c)."""
     p = 2 * (b * z - c * y)
     q = 2 * (c * x - a * z)
     r = 2 * (a * y - b * x)
@@ -56,7 +54,7 @@ def rotated(w, a, b, c, x, y, z):
 
 @triton.jit
 def _better(one, other, at: tl.constexpr):
-    """The row of Shepperd's table with the larger number ``at`` its diagonal."""
+    """Select the row of Shepperd's table with the larger diagonal number, at index ``at`` of ``other``."""
     is_better = other[at] > one[4]
     w = tl.where(is_better, other[0], one[0])
     x = tl.where(is_better, other[1], one[1])
@@ -67,7 +65,7 @@ def _better(one, other, at: tl.constexpr):
 
 @triton.jit
 def _to_world(extrinsics, image):
-    """The quaternion from axes of a camera to the world (Shepperd 1978)."""
+    """Quaternion from camera axes to the world (Shepperd 1978)."""
     a, ba, ca, _ = load4(extrinsics, image * 4)
     ab, b, cb, _ = load4(extrinsics, image * 4 + 1)
     ac, bc, c, _ = load4(extrinsics, image * 4 + 2)
@@ -86,20 +84,8 @@ def _to_world(extrinsics, image):
 
 @triton.jit
 def _neighbour(depth, valid, image, row, column, own, footprint, height, width):
-    """How much deeper a neighbour is, times its weight from 0 to 1, and the weight:
-    0 for another surface.
-
-    Args:
-        depth: [images, height, width] in metres.
-        valid: [images, height, width], which depths are.
-        image: number of the image.
-        row: of the neighbour, perhaps outside the image.
-        column: of the neighbour.
-        own: depth of the pixel itself.
-        footprint: side of the pixel there, in metres.
-        height: of the images.
-        width: of the images.
-    """
+    """Depth difference of a neighbour, which may be outside the image, times its weight in [0, 1], and the
+    weight, which is 0 on another surface."""
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     place = (image * height + row) * width + column
     is_valid = inside & (tl.load(valid + place, inside, 0) != 0)
@@ -110,21 +96,7 @@ def _neighbour(depth, valid, image, row, column, own, footprint, height, width):
 
 @triton.jit
 def _slope(depth, valid, image, row, column, down, right, own, footprint, height, width):
-    """Relative change of depth from a pixel to the next along an axis.
-
-    Args:
-        depth: [images, height, width] in metres.
-        valid: [images, height, width], which depths are.
-        image: number of the image.
-        row: of the pixel.
-        column: of the pixel.
-        down: rows to the next pixel.
-        right: columns to the next pixel.
-        own: depth of the pixel.
-        footprint: side of the pixel there, in metres.
-        height: of the images.
-        width: of the images.
-    """
+    """Relative depth change from a pixel to the next one, ``down`` rows and ``right`` columns away."""
     after, near = _neighbour(depth, valid, image, row + down, column + right, own, footprint, height, width)
     before, other = _neighbour(depth, valid, image, row - down, column - right, own, footprint, height, width)
     return (after - before) / ((1 + near * other) * own + after + before)
@@ -132,18 +104,18 @@ def _slope(depth, valid, image, row, column, down, right, own, footprint, height
 
 @triton.jit
 def surface_axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height, width):
-    """The quaternion from axes of the surface to the world.
+    """Quaternion from surface axes to the world.
 
     Args:
-        depth: [images, height, width] in metres.
-        valid: [images, height, width], which depths are.
-        intrinsics: [images, 3, 3] in pixels.
-        extrinsics: [images, 4, 4].
-        image: number of the image.
-        pixel: row-major index.
-        own: depth of the pixel.
-        height: of the images.
-        width: of the images.
+        depth: in metres [images, height, width].
+        valid: whether depths are valid [images, height, width].
+        intrinsics: in pixels [images, 3, 3].
+        extrinsics: world to camera [images, 4, 4].
+        image: index of the image.
+        pixel: row-major index of the pixel.
+        own: depth of the pixel in metres.
+        height: height of the images in pixels.
+        width: width of the images in pixels.
     """
     row = pixel // width
     column = pixel % width
@@ -162,8 +134,8 @@ def surface_axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height
 
 @triton.jit
 def _sigmoid(x):
-    """The sigmoid of ``x`` within its limit, and its slope,
-    exact also where the sigmoid is nearly 1."""
+    """Sigmoid of ``x`` clamped to its limit, and its slope, which is exact also where the sigmoid is
+    nearly 1."""
     x = clamp(x, -SIGMOID, SIGMOID)
     shrunk = tl.exp(-tl.abs(x))
     other = 1 / (1 + shrunk)
@@ -172,34 +144,21 @@ def _sigmoid(x):
 
 @triton.jit
 def _back(slope, own, x, limit):
-    """Gradient of an activation: beyond the limit only what leads back into it remains.
-
-    Args:
-        slope: gradient of its result.
-        own: slope of the activation.
-        x: its argument.
-        limit: largest argument.
-    """
+    """Gradient of an activation with slope ``own``; beyond the limit, only a gradient that leads back
+    remains."""
     return tl.where((tl.abs(x) <= limit) | (slope * x > 0), slope * own, 0.0)
 
 
 @triton.jit
 def _tanh_back(slope, x):
-    """Gradient of a tanh within its limit."""
+    """Gradient of a clamped tanh."""
     shrunk = tl.exp(-2 * tl.abs(clamp(x, -TANH, TANH)))
     return _back(slope, 4 * shrunk / ((1 + shrunk) * (1 + shrunk)), x, TANH)
 
 
 @triton.jit
 def _depth_and_footprint(depth, intrinsics, image, place):
-    """Depths, and sides of the pixels there, in metres.
-
-    Args:
-        depth: [images, height, width] in metres.
-        intrinsics: [images, 3, 3] in pixels.
-        image: number of the image.
-        place: index of the pixel among those of all images.
-    """
+    """Depths at pixels, indexed over all images, and the sides of the pixels at these depths, in metres."""
     own = tl.load(depth + place)
     fx = tl.load(intrinsics + image * 9)
     fy = tl.load(intrinsics + image * 9 + 4)
@@ -208,28 +167,13 @@ def _depth_and_footprint(depth, intrinsics, image, place):
 
 @triton.jit
 def _offset(x, limit, unit, HAS_LIMIT: tl.constexpr):
-    """A coordinate of an offset in metres.
-
-    Args:
-        x: raw value.
-        limit: largest offset in metres.
-        unit: offset in metres for a raw value of 1 where there is no limit.
-        HAS_LIMIT: whether there is one.
-    """
+    """One coordinate of an offset in metres, from its raw value."""
     return limit * tanh(clamp(x, -TANH, TANH)) if HAS_LIMIT else unit * x
 
 
 @triton.jit
 def _offset_back(slope, x, limit, unit, HAS_LIMIT: tl.constexpr):
-    """Gradient of the raw value of an offset's coordinate.
-
-    Args:
-        slope: gradient of the coordinate.
-        x: raw value.
-        limit: largest offset in metres.
-        unit: offset in metres for a raw value of 1 where there is no limit.
-        HAS_LIMIT: whether there is one.
-    """
+    """Gradient of the raw value of one coordinate of an offset."""
     return _tanh_back(limit * slope, x) if HAS_LIMIT else unit * slope
 
 
@@ -246,21 +190,21 @@ def activate_rows(
     Args:
         count: number N of Gaussians.
         offset, scale, rotation, opacity, color: raw, [N, 3], [N, 3], [N, 4], [N] and [N, 3].
-        image: [N], numbers of the images (``b * V + v``) that they belong to.
-        pixel: [N], row-major indices of their pixels.
-        depth, valid: [B, V, height, width], in metres, and which depths are valid.
-        points: [B, V, height, width, 3], world points in metres.
-        photo: [B, V, 3, height, width], colours.
-        share: [B, V, height, width], factors of opacities.
+        image: index of each Gaussian's image (``b * V + v``) [N].
+        pixel: row-major index of its pixel [N].
+        depth, valid: depths in metres, and whether they are valid [B, V, height, width].
+        points: world points in metres [B, V, height, width, 3].
+        photo: colours [B, V, 3, height, width].
+        share: factors of the opacities [B, V, height, width].
         intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
-        means, quaternions, scales, opacities, colors: [N, 3], [N, 4], [N, 3], [N] and [N, 3],
-            written.
-        height, width: of the images.
-        limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
-            :class:`ghgs_lit.ops.activation.Constants`, in their order.
-        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether there are a limit of offsets, raw colours, factors.
-        ON_SURFACE: raw values are in axes of the surface.
-        ROWS: Gaussians of a program.
+        means, quaternions, scales, opacities, colors: written, [N, 3], [N, 4], [N, 3], [N] and
+            [N, 3].
+        height, width: size of the images in pixels.
+        limit, unit, inward, floor, span, across, thickness, least, bias, change: fields of
+            :class:`ghgs_lit.ops.activation.Constants`, in order.
+        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether offsets are limited, and raw colours and factors given.
+        ON_SURFACE: raw values refer to surface axes.
+        ROWS: Gaussians per program.
     """
     i = rows_of(count, ROWS)
     view = tl.load(image + i)
@@ -307,20 +251,20 @@ def activate_back_rows(
     Args:
         count: number N of Gaussians.
         offset, scale, rotation, opacity, color: raw, [N, 3], [N, 3], [N, 4], [N] and [N, 3].
-        image: [N], numbers of the images (``b * V + v``) that they belong to.
-        pixel: [N], row-major indices of their pixels.
-        depth, valid: [B, V, height, width], in metres, and which depths are valid.
-        share: [B, V, height, width], factors of opacities.
+        image: index of each Gaussian's image (``b * V + v``) [N].
+        pixel: row-major index of its pixel [N].
+        depth, valid: depths in metres, and whether they are valid [B, V, height, width].
+        share: factors of the opacities [B, V, height, width].
         intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
         of_means, of_quaternions, of_scales, of_opacities, of_colors: gradients of the results.
         d_offset, d_scale, d_rotation, d_opacity, d_color: written, gradients of raw values.
-        d_points: [B, V, height, width, 3], gradients of points are added.
-        height, width: of the images.
-        limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
-            :class:`ghgs_lit.ops.activation.Constants`, in their order.
-        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether there are a limit of offsets, raw colours, factors.
-        ON_SURFACE: raw values are in axes of the surface.
-        ROWS: Gaussians of a program.
+        d_points: accumulated, gradients of points [B, V, height, width, 3].
+        height, width: size of the images in pixels.
+        limit, unit, inward, floor, span, across, thickness, least, bias, change: fields of
+            :class:`ghgs_lit.ops.activation.Constants`, in order.
+        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether offsets are limited, and raw colours and factors given.
+        ON_SURFACE: raw values refer to surface axes.
+        ROWS: Gaussians per program.
     """
     i = rows_of(count, ROWS)
     view = tl.load(image + i)
@@ -328,14 +272,14 @@ def activate_back_rows(
     place = view * height * width + at
     own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
     x, y, z = load3(of_means, i)
-    # Added, since a plan may list a pixel more than once; not by rows that repeat the last one.
+    # Added, since a pixel may be listed more than once; masked in rows that repeat the last one.
     is_own = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS) < count
     tl.atomic_add(d_points + 3 * place, x, is_own)
     tl.atomic_add(d_points + 3 * place + 1, y, is_own)
     tl.atomic_add(d_points + 3 * place + 2, z, is_own)
     w, a, b, c = load4(of_quaternions, i)
     if ON_SURFACE:
-        # Rotations and products with unit quaternions are transposed by the conjugate.
+        # The transpose of a rotation or of a product with a unit quaternion uses its conjugate.
         p, q, r, s = surface_axes(depth, valid, intrinsics, extrinsics, view, at, own, height, width)
         x, y, z = rotated(p, -q, -r, -s, x, y, z)
         w, a, b, c = product(p, -q, -r, -s, w, a, b, c)
@@ -368,20 +312,13 @@ def activate_back_rows(
 
 
 def _flags(constants: list[float], color: Tensor | None, share: Tensor | None, on_surface: bool) -> dict:
-    """What the kernels are compiled for.
-
-    Args:
-        constants: numbers of :class:`ghgs_lit.ops.activation.Constants`, in their order.
-        color: raw colours; None: none.
-        share: factors of opacities; None: none.
-        on_surface: raw values are in axes of the surface.
-    """
+    """Compile-time constants of the kernels."""
     flags = {"HAS_LIMIT": constants[0] > 0, "HAS_COLOR": color is not None, "HAS_SHARE": share is not None}
     return {**flags, "ON_SURFACE": on_surface}
 
 
 def activate(*inputs) -> tuple[Tensor, ...]:
-    """The operator of :mod:`ghgs_lit.ops.activation`."""
+    """Kernel of the operator ``activate`` of :mod:`ghgs_lit.ops.activation`."""
     *tensors, constants, on_surface = inputs
     offset, color, image, depth, share = (tensors[k] for k in (0, 4, 5, 7, 11))
     out = [offset.new_empty(len(image), *size) for size in ((3,), (4,), (3,), (), (3,))]
@@ -391,7 +328,7 @@ def activate(*inputs) -> tuple[Tensor, ...]:
 
 
 def activate_back(*inputs) -> list[Tensor]:
-    """The operator of :mod:`ghgs_lit.ops.activation`."""
+    """Kernel of the operator ``activate_back`` of :mod:`ghgs_lit.ops.activation`."""
     *tensors, constants, on_surface, slopes = inputs
     offset, color, image, depth, points, share = (tensors[k] for k in (0, 4, 5, 7, 9, 11))
     gradients = [offset.new_empty(0 if x is None else x.shape) for x in tensors[:5]]

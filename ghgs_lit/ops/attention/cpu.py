@@ -1,5 +1,5 @@
-"""Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al.,
-FlashAttention, 2022). Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``."""
+"""CPU kernel of attention, ``KEYS`` keys at a time with a running maximum (FlashAttention, Dao et al.
+2022). Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``."""
 
 import itertools
 import math
@@ -16,9 +16,9 @@ from ghgs_lit.ops.compile import NUMBER, helper, kernel_for
 from ghgs_lit.ops.layers import PANEL, ROWS, make_product, product
 from ghgs_lit.ops.simd import EXP2_LIMIT
 
-#: Keys whose scores are in memory at once.
+#: Number of keys whose scores are in memory at once.
 KEYS = 256
-#: Queries that are compared with those keys before the next keys are read.
+#: Number of queries that are multiplied with these keys before the next keys are read.
 QUERIES = 96
 
 LANES = simd.LANES
@@ -31,15 +31,15 @@ add_values = make_product((KEYS, 1), adds=True)
 def attend_head(q, k, v, out, first, last):
     """Write ``softmax(q k^T / sqrt(d)) v`` of some queries of a head.
 
-    All matrices have any strides, and a width d that is a multiple of 32.
+    Matrices may have any strides; their width d is a multiple of 32.
 
     Args:
         q: queries [t, d].
         k: keys [s, d].
         v: values [s, d].
-        out: for the result [t, d].
-        first: number of the first query.
-        last: number after the last one.
+        out: written [t, d].
+        first: first query.
+        last: end of the queries, excluded.
     """
     tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
@@ -80,7 +80,7 @@ def _padded(count):
 
 @helper
 def _packed_keys(k):
-    """Panels of ``PANEL`` keys, each [channels, PANEL]; the last one is filled with zeros."""
+    """Pack keys into panels [channels, PANEL]; the last panel is padded with zeros."""
     tokens, steps = k.shape
     packed = simd.aligned(_padded(tokens) * steps)
     for panel in range(0, tokens, PANEL):
@@ -96,7 +96,7 @@ def _packed_keys(k):
 
 @helper
 def _packed_values(v):
-    """Panels of ``PANEL`` channels, each [tokens, PANEL]; tokens are filled up with zeros."""
+    """Pack values into panels [tokens, PANEL] of ``PANEL`` channels; tokens are padded with zeros."""
     tokens, width = v.shape
     lines = _padded(tokens)
     packed = simd.aligned(lines * width)
@@ -110,14 +110,8 @@ def _packed_values(v):
 
 @helper
 def _pack_queries(q, start, count, packed):
-    """Write tiles of ``ROWS`` queries, each [channels, ROWS]; the last query fills the last tile.
-
-    Args:
-        q: queries [t, d].
-        start: number of the first one.
-        count: how many there are, up to ``QUERIES``.
-        packed: array [QUERIES * d] for the tiles.
-    """
+    """Pack ``count`` queries, at most ``QUERIES``, into tiles [channels, ROWS], of which the last is padded
+    with the last query."""
     steps = q.shape[1]
     for row in range(0, count, ROWS):
         for r in range(ROWS):
@@ -128,17 +122,8 @@ def _pack_queries(q, start, count, packed):
 
 @helper
 def _score(queries, row, keys, key, seen, steps, scores):
-    """Write the products of queries and keys, with -inf in the padding after them.
-
-    Args:
-        queries: tiles of :func:`_pack_queries`.
-        row: number of the first of ``ROWS`` queries.
-        keys: panels of :func:`_packed_keys`.
-        key: number of the first key.
-        seen: how many keys there are, up to ``KEYS``.
-        steps: channels d.
-        scores: array [ROWS * KEYS] for the products.
-    """
+    """Write the scores, [ROWS * KEYS], of ``ROWS`` queries and ``seen`` keys, at most ``KEYS``, padded with
+    -inf."""
     for panel in range(0, seen, PANEL):
         product(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
     for r in range(ROWS):
@@ -148,8 +133,7 @@ def _score(queries, row, keys, key, seen, steps, scores):
 
 @helper
 def _highest(scores, r, seen):
-    """The highest score of a row. NaN is ignored here;
-    it reaches the result through the weights."""
+    """Highest score of a row; it ignores NaN, which reaches the result through the weights."""
     highest = simd.full(LOWEST)
     for i in range(0, seen, LANES):
         highest = simd.maximum(memory.load(scores, r * KEYS + i), highest)
@@ -158,15 +142,8 @@ def _highest(scores, r, seen):
 
 @helper
 def _scale_down(exponent, sums, totals, r, width):
-    """Multiply what a query has summed up by ``2^exponent``, as its maximum has grown.
-
-    Args:
-        exponent: 0 or less.
-        sums: of weights, in lanes [QUERIES * LANES].
-        totals: of weighted values [QUERIES * d].
-        r: number of the query.
-        width: channels d.
-    """
+    """Rescale the sums of a query's weights and weighted values by ``2^exponent`` when its maximum has
+    grown, with ``exponent <= 0``."""
     factor = simd.exp2_minus(simd.full(min(-exponent, EXP2_LIMIT)))
     memory.store(sums, r * LANES, memory.load(sums, r * LANES) * factor)
     for i in range(r * width, (r + 1) * width, LANES):
@@ -175,25 +152,25 @@ def _scale_down(exponent, sums, totals, r, width):
 
 @helper
 def _weigh(scores, r, seen, scale, top, weights, sums, query):
-    """Write the weights ``2^(scale s - top)`` of a row of scores,
-    and add them to the sum of each lane.
+    """Write the weights ``2^(scale s - top)`` of a row of scores, and add them to the query's lanes of
+    ``sums``.
 
     Args:
-        scores: of :func:`_score`.
-        r: number of the row in them.
-        seen: how many keys there are.
+        scores: from :func:`_score`.
+        r: row of ``scores``.
+        seen: number of keys.
         scale: ``log2(e) / sqrt(d)``.
-        top: the highest score so far, times ``scale``.
-        weights: array [ROWS * KEYS] for the weights.
-        sums: of weights, in lanes [QUERIES * LANES].
-        query: number of the query in them.
+        top: highest score so far, times ``scale``.
+        weights: written [ROWS * KEYS].
+        sums: accumulated, sums of weights per lane [QUERIES * LANES].
+        query: index of the query in ``sums``.
     """
     total = memory.load(sums, query * LANES)
     minus = simd.full(-scale)
     limit = simd.full(EXP2_LIMIT)
     for i in range(0, _padded(seen), LANES):
         depth = simd.fma(memory.load(scores, r * KEYS + i), minus, top)
-        # ``minimum`` gives the second argument where either is NaN, so NaN stays.
+        # ``minimum`` returns the second argument where either is NaN, so NaN stays NaN.
         weight = simd.exp2_minus(simd.minimum(limit, depth))
         total = total + weight
         memory.store(weights, r * KEYS + i, weight)
@@ -202,17 +179,8 @@ def _weigh(scores, r, seen, scale, top, weights, sums, query):
 
 @helper
 def _add_values(weights, values, key, seen, totals, row, width):
-    """Add weighted values to the totals of ``ROWS`` queries.
-
-    Args:
-        weights: of these queries [ROWS * KEYS].
-        values: panels of :func:`_packed_values`.
-        key: number of the first key.
-        seen: how many keys there are, up to ``KEYS``.
-        totals: of weighted values [QUERIES * d].
-        row: number of the first query.
-        width: channels d.
-    """
+    """Add the values of ``seen`` keys, weighted by ``weights`` [ROWS * KEYS], to the ``totals``
+    [QUERIES * d] of ``ROWS`` queries."""
     lines = len(values) // width
     for panel in range(0, width, PANEL):
         at = row * width + panel
@@ -221,22 +189,14 @@ def _add_values(weights, values, key, seen, totals, row, width):
 
 @helper
 def _finish(out, sums, totals, r, width):
-    """Write the weighted values of a query, divided by the sum of its weights.
-
-    Args:
-        out: for the result [d].
-        sums: of weights, in lanes [QUERIES * LANES].
-        totals: of weighted values [QUERIES * d].
-        r: number of the query.
-        width: channels d.
-    """
+    """Write the weighted values of a query, divided by the sum of its weights, to ``out`` [d]."""
     share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
     for i in range(0, width, LANES):
         memory.store_anywhere(out, i, memory.load(totals, r * width + i) * simd.full(share))
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, keys: None) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.attention`."""
+    """Kernel of the operator of :mod:`ghgs_lit.ops.attention`."""
     return attend_heads(q, k, v).flatten(2)
 
 
@@ -249,13 +209,13 @@ def attend_heads(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         v: values [n, a, s, d].
 
     Returns:
-        [n, t, a, d] in the dtype of ``v``, with the same bits with any number of threads.
+        [n, t, a, d] in the dtype of ``v``, bitwise the same for any number of threads.
     """
     out = torch.empty(q.transpose(1, 2).shape)
     arrays = [_rows(x.float()).numpy() for x in (q, k, v, out.transpose(1, 2))]
     n, a, t, d = q.shape
     heads = list(itertools.product(range(n), range(a)))
-    # Every task packs keys and values again, so a head is split only if there are few heads.
+    # Each task packs keys and values again, so heads are split only if they are few.
     parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
     edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]
     compiled = attend_head()

@@ -1,8 +1,8 @@
-"""Which splats each tile of an image draws, in order of depth, without a wait of the host.
+"""Splats of each image tile in order of depth, without a device-to-host synchronisation.
 
-gsplat's own function asks the device for the number of intersections, and the GPU idles until the
-host has read it and has launched what follows. Here arrays have a fixed capacity instead, and the
-number needed is a tensor that can be read later (:mod:`ghgs_lit.rendering.capacity`)."""
+gsplat's function copies the number of intersections to the host, and the GPU idles until the host has
+read it and has launched the next kernels. Here arrays have a fixed capacity instead, and the required
+number is a tensor that can be read later (:mod:`ghgs_lit.rendering.capacity`)."""
 
 from functools import cache
 from typing import NamedTuple
@@ -21,18 +21,16 @@ TILE = 16
 class Intersections(NamedTuple):
     """Splats of all tiles, one tile after another.
 
-    Each image has a row of tiles below its own. No pixel lies in it, and the very last tile holds
-    the places that are not used: in gsplat's kernels a tile ends where the next one begins, the
-    last at the capacity.
+    Each image has an additional row of tiles below it, which contains no pixels; its last tile holds
+    the unused entries: in gsplat's kernels a tile ends where the next one begins, and the last tile
+    at the capacity.
 
     Attributes:
-        splats: index among all images' splats, in the order of gsplat's sorted keys: by image,
+        splats: indices among the splats of all images, in the order of gsplat's sorted keys: by image,
             tile, bits of the depth, index.
-        offsets: first place of each tile.
-        has_pixels: false in the rows below the images,
-            which gsplat then skips in the backward pass.
-        needed: number of intersections; where it exceeds the capacity,
-            the farthest splats are missing."""
+        offsets: first entry of each tile.
+        has_pixels: false in the additional rows, which gsplat then skips in the backward pass.
+        needed: number of intersections; if it exceeds the capacity, the farthest splats are missing."""
 
     splats: Int32[Tensor, " capacity"]
     offsets: Int32[Tensor, "*images rows columns"]
@@ -49,22 +47,22 @@ def intersections(
     width: int,
     capacity: int,
 ) -> Intersections:
-    """Intersections of splats with tiles, as gsplat's ``isect_tiles`` and ``isect_offset_encode``.
+    """Intersect splats with tiles, like gsplat's ``isect_tiles`` and ``isect_offset_encode``.
 
-    Splats are sorted by depth first, and then their places by tile. Both sorts are stable, so that
-    the order is that of gsplat's 64-bit keys, but most bytes are sorted once for a splat instead of
-    once for a tile.
+    Splats are sorted by depth first, then their intersections by tile. Both sorts are stable, so that
+    the order is that of gsplat's 64-bit keys, but most bytes are sorted once per splat instead of
+    once per intersection.
 
     Args:
-        centers: in pixels; anything where a radius is 0.
-        radii: half sides in pixels of the box that a splat touches; 0 where it is not drawn.
-        depths: float32, above 0 where a splat is drawn.
-        height: of the images, in pixels.
-        width: of the images, in pixels.
-        capacity: number of places, at least 1.
+        centers: centres in pixels; arbitrary where a radius is 0.
+        radii: half sides in pixels of the box that a splat touches; 0 for a splat that is not rendered.
+        depths: float32, above 0 for splats that are rendered.
+        height: image height in pixels.
+        width: image width in pixels.
+        capacity: number of entries, at least 1.
 
     Returns:
-        The splats of each tile in order of depth, and how many places they need.
+        The splats of each tile in order of depth, and the number of entries that they need.
     """
     shape = depths.shape[:-1]
     rows = -(-height // TILE)
@@ -76,7 +74,7 @@ def intersections(
     boxes = _BOXED(centers, radii, order, rows, columns)
     ends = boxes[0].cumsum(0)
     tile, splat = _PLACED(ends, boxes, order, fixed.every, capacity, columns)
-    # A radix sort passes once over each byte.
+    # Radix sort: the time is proportional to the number of bytes of a key.
     tile, order = tile.sort(stable=True)
     offsets = torch.searchsorted(tile, fixed.every, out_int32=True).view(fixed.has_pixels.shape)
     return Intersections(splat[order], offsets, fixed.has_pixels, ends[-1])
@@ -89,17 +87,17 @@ def _boxed(
     rows: int,
     columns: int,
 ) -> Int32[Tensor, "3 I*N"]:
-    """Tiles of each splat.
+    """Find the tiles of each splat.
 
     Args:
         centers: in pixels.
-        radii: half sides in pixels; 0 where a splat is not drawn.
-        order: splats of all images, in the order of the result.
-        rows: of tiles that have pixels, in one image.
-        columns: of tiles in one image.
+        radii: half sides in pixels; 0 for a splat that is not rendered.
+        order: indices of the splats of all images, in the order of the result.
+        rows: tile rows of an image that have pixels.
+        columns: tile columns of an image.
 
     Returns:
-        Number of each splat's tiles, index of the first one, and the number across (1 or more).
+        Number of tiles of each splat, index of the first tile, and number of tiles across (at least 1).
     """
     sizes = constant(_sizes, columns, rows, like=centers)
     reach = radii / TILE
@@ -114,7 +112,7 @@ def _boxed(
 
 
 def _sizes(columns: int, rows: int, **kind: object) -> Tensor:
-    """Tiles across and down, [2]."""
+    """Numbers of tiles across and down, [2]."""
     return torch.tensor((columns, rows), **kind)
 
 
@@ -126,18 +124,18 @@ def _placed(
     capacity: int,
     columns: int,
 ) -> tuple[Int[Tensor, " capacity"], Int32[Tensor, " capacity"]]:
-    """What each place holds: splats one after another, the tiles of each by rows.
+    """List all intersections: splats one after another, the tiles of each splat row by row.
 
     Args:
-        ends: places up to the end of each splat's.
-        boxes: as of :func:`_boxed`.
-        order: splats of the rows of ``ends`` and ``boxes``.
-        every: numbers of all tiles; places that no splat needs are of the last one.
-        capacity: number of places.
-        columns: of tiles in one image.
+        ends: end of each splat's intersections, the cumulative number of tiles.
+        boxes: from :func:`_boxed`.
+        order: indices of the splats in ``ends`` and ``boxes``.
+        every: indices of all tiles; unused entries get the last one.
+        capacity: number of entries.
+        columns: tile columns of an image.
 
     Returns:
-        The tile of each place, in the type of ``every``, and its splat.
+        The tile of each entry, in the dtype of ``every``, and its splat.
     """
     place = constant(torch.arange, capacity, like=ends)
     row = torch.searchsorted(ends, place, right=True)
@@ -166,30 +164,24 @@ _PLACED = Operator(
 
 
 class _Fixed(NamedTuple):
-    """What depends on the number and the size of images alone.
+    """Constants that depend only on the number and the size of the images.
 
     Attributes:
-        every: numbers of all tiles, with the row below each image.
-        has_pixels: as of :class:`Intersections`.
+        every: indices of all tiles, the row below each image included.
+        has_pixels: see :class:`Intersections`.
     """
 
     every: Tensor
     has_pixels: Tensor
 
 
-# without a limit: a recorded CUDA graph draws with them
+# unbounded: captured CUDA graphs refer to these tensors
 @cache
-# a validation may ask first, and a training step has them in its graph
+# the first call may be in a validation, but training steps save these tensors for the backward pass
 @torch.inference_mode(False)
 def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:
-    """Constants of :func:`intersections` on a device, kept for later calls.
-
-    Args:
-        images: shape of the batch of images.
-        rows: of tiles that have pixels, in one image.
-        columns: of tiles in one image.
-        device: where the tensors are needed.
-    """
+    """Constants of :func:`intersections` for a batch shape ``images`` with ``rows`` x ``columns`` tiles
+    each, cached per device."""
     count = images.numel() * (rows + 1) * columns
     every = torch.arange(count, dtype=torch.int16 if count <= 2**15 else torch.int32)
     has_pixels = torch.ones(*images, rows + 1, columns, dtype=torch.bool)

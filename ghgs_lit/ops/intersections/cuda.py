@@ -1,5 +1,4 @@
-"""Which splats each tile draws, for a GPU, in Triton;
-see :mod:`ghgs_lit.ops.intersections`."""
+"""Triton kernels of the intersections of splats with tiles; see :mod:`ghgs_lit.ops.intersections`."""
 
 import torch
 import triton
@@ -13,19 +12,19 @@ TILE = tl.constexpr(16)
 
 @triton.jit
 def ends_of(center, radius, limit):
-    """First and last tile of a splat along one side of an image.
+    """Range of tiles of a splat along one axis of an image.
 
     Args:
-        center: in pixels.
-        radius: half side of its box in pixels.
-        limit: number of tiles along this side.
+        center: centre of the splat in pixels.
+        radius: half side of the splat's box in pixels.
+        limit: number of tiles along this axis.
 
     Returns:
         The first tile, and the one after the last, from 0 to ``limit``.
     """
     reach = radius.to(tl.float32) / TILE
     middle = center / TILE
-    most = limit + 0.0  # a single tile is a constant of the compiler
+    most = limit + 0.0  # Triton makes an integer argument of 1 a compile-time constant
     begin = tl.minimum(tl.maximum(tl.floor(middle - reach), 0.0), most)
     end = tl.minimum(tl.maximum(tl.ceil(middle + reach), 0.0), most)
     return begin.to(tl.int32), end.to(tl.int32)
@@ -36,22 +35,22 @@ def boxed_rows(count, centers, radii, order, out, per_image, rows, columns, ROWS
     """Write the tiles of ``ROWS`` splats; see :func:`boxed`.
 
     Args:
-        count: number of splats of all images, N.
-        centers: [N, 2] in pixels.
-        radii: [N, 2], half sides in pixels; 0 where a splat is not drawn.
-        order: [N], splats in the order of the rows that are written.
-        out: [3, N], written: numbers of tiles, the first one, and the number across.
-        per_image: splats of an image.
-        rows: of tiles that have pixels, in one image.
-        columns: of tiles in one image.
-        ROWS: splats of a program.
+        count: number N of splats of all images.
+        centers: in pixels [N, 2].
+        radii: half sides in pixels [N, 2]; 0 for a splat that is not rendered.
+        order: indices of splats, in the order of the result [N].
+        out: written, number of tiles, first tile and number of tiles across [3, N].
+        per_image: number of splats of an image.
+        rows: tile rows of an image that have pixels.
+        columns: tile columns of an image.
+        ROWS: splats per program.
     """
     i = rows_of(count, ROWS)
     splat = tl.load(order + i)
     across = tl.load(radii + 2 * splat)
     down = tl.load(radii + 2 * splat + 1)
     is_drawn = (across > 0) & (down > 0)
-    # What is not drawn may have a centre that is not finite.
+    # The centre of a splat that is not rendered may be NaN or infinite.
     x = tl.where(is_drawn, tl.load(centers + 2 * splat), 0.0)
     y = tl.where(is_drawn, tl.load(centers + 2 * splat + 1), 0.0)
     left, right = ends_of(x, across, columns)
@@ -66,20 +65,20 @@ def boxed_rows(count, centers, radii, order, out, per_image, rows, columns, ROWS
 def placed_rows(
     count, ends, boxes, order, tile, splat, splats, steps, columns, last, ROWS: tl.constexpr
 ):  # fmt: skip
-    """Write what ``ROWS`` places hold; see :func:`placed`.
+    """Write ``ROWS`` entries; see :func:`placed`.
 
     Args:
-        count: number of places.
-        ends: [N], places up to the end of each splat's, ascending.
-        boxes: [3, N], as written by :func:`boxed_rows`.
-        order: [N], the splats of the rows of ``ends`` and ``boxes``.
-        tile: [count], written: the tile of each place.
-        splat: [count], written: the splat of each place.
+        count: number of entries.
+        ends: end of each splat's intersections, ascending [N].
+        boxes: written by :func:`boxed_rows` [3, N].
+        order: indices of the splats in ``ends`` and ``boxes`` [N].
+        tile: written, the tile of each entry [count].
+        splat: written, the splat of each entry [count].
         splats: N.
-        steps: of a search among the splats.
-        columns: of tiles in one image.
-        last: tile of places that no splat needs.
-        ROWS: places of a program.
+        steps: steps of the binary search among the splats.
+        columns: tile columns of an image.
+        last: tile of unused entries.
+        ROWS: entries per program.
     """
     place = rows_of(count, ROWS)
     low = tl.zeros_like(place)
@@ -103,17 +102,17 @@ def placed_rows(
 
 
 def boxed(centers: Tensor, radii: Tensor, order: Tensor, rows: int, columns: int) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.intersections`.
+    """Kernel of the operator ``boxed`` of :mod:`ghgs_lit.ops.intersections`.
 
     Args:
-        centers: of splats in pixels [I, N, 2].
-        radii: half sides in pixels [I, N, 2]; 0 where a splat is not drawn.
-        order: splats of all images [I * N], in the order of the result.
-        rows: of tiles that have pixels, in one image.
-        columns: of tiles in one image.
+        centers: centres of splats in pixels [I, N, 2].
+        radii: half sides in pixels [I, N, 2]; 0 for a splat that is not rendered.
+        order: indices of the splats of all images [I * N], in the order of the result.
+        rows: tile rows of an image that have pixels.
+        columns: tile columns of an image.
 
     Returns:
-        Number of each splat's tiles, index of the first one, and the number across [3, I * N].
+        Number of tiles of each splat, index of the first tile, and number of tiles across [3, I * N].
     """
     out = radii.new_empty(3, len(order), dtype=torch.int32)
     start(boxed_rows, len(order), centers, radii, order, out, centers.shape[1], rows, columns)
@@ -123,18 +122,18 @@ def boxed(centers: Tensor, radii: Tensor, order: Tensor, rows: int, columns: int
 def placed(
     ends: Tensor, boxes: Tensor, order: Tensor, every: Tensor, capacity: int, columns: int
 ) -> tuple[Tensor, Tensor]:
-    """The operator of :mod:`ghgs_lit.ops.intersections`.
+    """Kernel of the operator ``placed`` of :mod:`ghgs_lit.ops.intersections`.
 
     Args:
-        ends: places up to the end of each splat's [N].
-        boxes: as of :func:`boxed` [3, N].
-        order: splats of the rows of ``ends`` and ``boxes`` [N].
-        every: numbers of all tiles; places that no splat needs are of the last one.
-        capacity: number of places.
-        columns: of tiles in one image.
+        ends: end of each splat's intersections [N].
+        boxes: from :func:`boxed` [3, N].
+        order: indices of the splats in ``ends`` and ``boxes`` [N].
+        every: indices of all tiles; unused entries get the last one.
+        capacity: number of entries.
+        columns: tile columns of an image.
 
     Returns:
-        The tile of each place, in the type of ``every``, and its splat [capacity].
+        The tile of each entry, in the dtype of ``every``, and its splat [capacity].
     """
     tile = every.new_empty(capacity)
     splat = boxes.new_empty(capacity)

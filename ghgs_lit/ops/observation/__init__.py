@@ -1,4 +1,4 @@
-"""What photographs and renders show at the positions of Gaussians."""
+"""Comparison of Gaussians with input views and renders at their projected positions."""
 
 from collections.abc import Sequence
 
@@ -12,9 +12,9 @@ from ghgs_lit.geometry.projection import project
 from ghgs_lit.ops.dispatch import Operator, everything
 from ghgs_lit.types import Cameras
 
-#: Values of a Gaussian in a view: photograph minus its own colour (3), photograph minus render
-#: (3), mask, alpha, distance behind the rendered surface, whether the view can see it, whether the
-#: view is its own.
+#: Values of a Gaussian in a view: image minus the Gaussian's colour (3), image minus render (3), mask,
+#: alpha, distance behind the rendered surface, whether the Gaussian is visible in the view, whether
+#: the view is its own.
 CHANNELS = 11
 
 
@@ -32,20 +32,20 @@ def _compared(
     scale: float,
     splits: Sequence[int],
 ) -> Float[Tensor, "N V c"]:
-    """Values of each Gaussian in each view, its own first, in plain PyTorch.
+    """Compute the values of each Gaussian in each view, its own view first, in plain PyTorch.
 
     Args:
-        means: of the Gaussians, in metres.
-        colors: of the Gaussians.
-        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
-        intrinsics: of the views, in pixels.
-        extrinsics: of the views.
-        photo: photographs.
-        mask: share of each pixel that shows the subject.
-        drawn: rendered colours, as are the next two.
+        means: means of the Gaussians, in metres.
+        colors: colours of the Gaussians.
+        image: index of each Gaussian's image (``b * V + v``), ascending.
+        intrinsics: intrinsics of the views, in pixels.
+        extrinsics: world-to-camera matrices of the views.
+        photo: input views.
+        mask: coverage of each pixel by the subject.
+        drawn: rendered colours.
         alpha: rendered opacities.
         depth: rendered depths in metres.
-        scale: of the distance behind the rendered surface, in metres.
+        scale: scale of the distance behind the rendered surface, in metres.
         splits: number of Gaussians of each element.
     """
     views = photo.shape[1]
@@ -72,7 +72,7 @@ observations = Operator(
 
 
 def _cyclic(views: int, **kind: object) -> Tensor:
-    """The views from each on, in cyclic order: [V, V]."""
+    """For each view, all views in cyclic order from it on, [V, V]."""
     view = torch.arange(views, **kind)
     return (view[:, None] + view) % views
 
@@ -80,30 +80,30 @@ def _cyclic(views: int, **kind: object) -> Tensor:
 def values_at(
     means: Tensor, image: Tensor, splits: Sequence[int], cameras: Cameras, maps: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Values of maps at projected means, bilinear; 0 beyond the border.
+    """Sample maps bilinearly at projected means; 0 outside the maps.
 
     Args:
-        means: [N, 3] in the world.
-        image: [N], numbers of the images (``b * V + v``) that they belong to, ascending.
+        means: in the world [N, 3].
+        image: index of each mean's image (``b * V + v``), ascending [N].
         splits: number of means of each element.
-        cameras: [B, V], of the maps.
+        cameras: cameras of the maps, [B, V].
         maps: [B, V, c, H, W].
 
     Returns:
-        Values in each view, z-depths there, and whether the view can see the means: in its frame,
-        in front.
+        Values in each view [N, V, c], z-depths [N, V, 1], and whether the means are in front of the
+        camera and inside the frame [N, V, 1].
     """
     b, views, channels, height, width = maps.shape
     rows = None
     means = means[None]
     if b > 1:
-        # One row of points for each element; those with fewer have points at 0 at the end.
+        # One row of points per element, padded with points at 0.
         rows = _rows(image // views, splits)
         means = means.new_zeros(b, max(splits), 3).index_put(rows, means[0])
     means = means[:, None].expand(-1, views, -1, -1)
     pixels, z = project(means, cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
     size = constant(torch.tensor, (width, height), like=pixels)
-    # Pixels far outside are clamped: large numbers are not exact.
+    # Clamp pixels far outside: large numbers are inexact.
     grid = (2 / size * pixels - 1).clamp(-3, 3).flatten(0, 1)[:, None]
     sampled = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)[:, :, 0]
     can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
@@ -113,6 +113,6 @@ def values_at(
 
 
 def _rows(element: Int[Tensor, " N"], splits: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """The element of each Gaussian, ascending, and its number among those of the element."""
+    """The element of each Gaussian, ascending, and its index within the element."""
     first = torch.searchsorted(element, constant(torch.arange, len(splits), like=element))
     return element, torch.arange(len(element), device=element.device) - first[element]

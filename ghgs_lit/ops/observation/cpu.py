@@ -1,4 +1,4 @@
-"""The kernel of observations."""
+"""CPU kernel of the observations of Gaussians."""
 
 from itertools import accumulate, pairwise
 from typing import Any
@@ -22,26 +22,14 @@ _MAPS = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
 
 @helper
 def _axis(row, x, y, z):
-    """Coordinate of points along an axis of a camera, in metres.
-
-    Args:
-        row: of [R t], of the axis.
-        x: coordinates in the world, 16 points, as are the next two.
-        y: second coordinates.
-        z: third coordinates.
-    """
+    """Coordinates of 16 world points along the camera axis given by a row of [R t], in metres."""
     return row[0] * x + (row[1] * y + (row[2] * z + row[3]))
 
 
 @helper
 def _put_cells(place, side, cells):
-    """Write the two cells around positions along an axis and their weights, 0 beyond the border.
-
-    Args:
-        place: positions in pixels, with centres at +0.5.
-        side: pixels along the axis.
-        cells: written: the first cells, the second ones, and the weights of both.
-    """
+    """Write the first and second cells around positions along an axis, in pixels with centres at +0.5, and
+    their weights, which are 0 outside."""
     place = place - HALF
     first = simd.floor(place)
     share = place - first
@@ -54,22 +42,14 @@ def _put_cells(place, side, cells):
 
 @helper
 def _between(plane, rows, columns, weights):
-    """Bilinear value of a map.
-
-    Args:
-        plane: [H, W].
-        rows: numbers of two rows.
-        columns: numbers of two columns.
-        weights: of the four pixels, row by row.
-    """
+    """Bilinear value of a map [H, W], from two rows, two columns and four weights, row by row."""
     upper = weights[0] * plane[rows[0], columns[0]] + weights[1] * plane[rows[0], columns[1]]
     return upper + (weights[2] * plane[rows[1], columns[0]] + weights[3] * plane[rows[1], columns[1]])
 
 
 @helper
 def _cells(lane, down, across):
-    """Rows, columns and weights of the four pixels around one of 16 points,
-    from :func:`_put_cells`."""
+    """Rows, columns and weights of the four pixels around one of 16 points; see :func:`_put_cells`."""
     rows = np.uint64(down[lane]), np.uint64(down[LANES + lane])
     columns = np.uint64(across[lane]), np.uint64(across[LANES + lane])
     top = down[2 * LANES + lane]
@@ -81,22 +61,22 @@ def _cells(lane, down, across):
 
 @helper
 def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
-    """Write the cells around points in a view, and their depths.
+    """Project 16 points into a view: write the cells around them and their depths.
 
     Args:
         camera: intrinsics [3, 3] in pixels.
         pose: extrinsics [4, 4].
-        x: coordinates in the world, in metres, 16 points, as are the next two.
-        y: second coordinates.
-        z: third coordinates.
-        height: of the view in pixels.
-        width: of the view in pixels.
-        down: written, cells along a column, from :func:`_put_cells`.
+        x: world coordinates in metres.
+        y: world coordinates in metres.
+        z: world coordinates in metres.
+        height: height of the view in pixels.
+        width: width of the view in pixels.
+        down: written, cells along a column; see :func:`_put_cells`.
         across: written, cells along a row.
         z_depth: written, depths in metres.
 
     Returns:
-        The points that the view can see, as bits.
+        Bit mask of the points that are in front of the camera and inside the frame.
     """
     distance = _axis(pose[2], x, y, z)
     inverse = ONE / distance
@@ -118,18 +98,18 @@ def observe_rows(
     """Write rows of the observations of one element; see :func:`observe`.
 
     Args:
-        means: [N, 3] in metres.
+        means: in metres [N, 3].
         colors: [N, 3].
-        image: [N], numbers of the images (``b * V + v``) that the Gaussians belong to.
-        intrinsics: [B, V, 3, 3] in pixels.
-        extrinsics: [B, V, 4, 4].
-        photo: [B, V, 3, H, W], photographs.
-        mask: [B, V, H, W], share of each pixel that shows the subject.
-        drawn: [B, V, 3, H, W], rendered colours.
-        alpha: [B, V, 1, H, W], rendered opacities.
-        depth: [B, V, 1, H, W], rendered depths in metres.
-        near: scale in metres of the distance behind the rendered surface.
-        out: [N, V, 11], written in these rows.
+        image: index of each Gaussian's image (``b * V + v``) [N].
+        intrinsics: in pixels [B, V, 3, 3].
+        extrinsics: world to camera [B, V, 4, 4].
+        photo: input views [B, V, 3, H, W].
+        mask: coverage of each pixel by the subject [B, V, H, W].
+        drawn: rendered colours [B, V, 3, H, W].
+        alpha: rendered opacities [B, V, 1, H, W].
+        depth: rendered depths in metres [B, V, 1, H, W].
+        near: scale of the distance behind the rendered surface, in metres.
+        out: written in these rows [N, V, 11].
         first: first row.
         last: end of the rows, excluded.
     """
@@ -142,7 +122,7 @@ def observe_rows(
     behind = simd.aligned(LANES)
     down = simd.aligned(4 * LANES)
     across = simd.aligned(4 * LANES)
-    # Index of each view among the values of a Gaussian, for each own view.
+    # Position of each view in the output of a Gaussian, for each own view.
     places = np.empty((views, views), np.int64)
     for own in range(views):
         for view in range(views):
@@ -187,7 +167,7 @@ _TASK = 1024
 
 
 def observe(*inputs: Any) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.observation`."""
+    """Kernel of the operator of :mod:`ghgs_lit.ops.observation`."""
     *tensors, near, splits = inputs
     means = tensors[0]
     photo = tensors[5]

@@ -1,5 +1,6 @@
-"""Observations for a GPU, in Triton: a row of a program is a Gaussian in a view; bilinear values are
-as of ``grid_sample``."""
+"""Triton kernel of the observations of Gaussians; a row of a program is a Gaussian in a view.
+
+Bilinear sampling follows ``grid_sample``."""
 
 import triton
 import triton.language as tl
@@ -19,22 +20,22 @@ def observe_rows(
 
     Args:
         count: number of observations, N V.
-        means: [N, 3] in metres.
+        means: in metres [N, 3].
         colors: [N, 3].
-        image: [N], numbers of the images (``b * V + v``) that the Gaussians belong to.
-        intrinsics: [B, V, 3, 3] in pixels.
-        extrinsics: [B, V, 4, 4].
-        photo: [B, V, 3, height, width], photographs.
-        mask: [B, V, height, width], share of each pixel that shows the subject.
-        drawn: [B, V, 3, height, width], rendered colours.
-        alpha: [B, V, 1, height, width], rendered opacities.
-        depth: [B, V, 1, height, width], rendered depths in metres.
-        out: [N, V, 11], written.
+        image: index of each Gaussian's image (``b * V + v``) [N].
+        intrinsics: in pixels [B, V, 3, 3].
+        extrinsics: world to camera [B, V, 4, 4].
+        photo: input views [B, V, 3, height, width].
+        mask: coverage of each pixel by the subject [B, V, height, width].
+        drawn: rendered colours [B, V, 3, height, width].
+        alpha: rendered opacities [B, V, 1, height, width].
+        depth: rendered depths in metres [B, V, 1, height, width].
+        out: written [N, V, 11].
         views: V.
-        height: of the photographs.
-        width: of the photographs.
-        scale: of the distance behind the rendered surface, in metres.
-        ROWS: observations of a program.
+        height: height of the views in pixels.
+        width: width of the views in pixels.
+        scale: scale of the distance behind the rendered surface, in metres.
+        ROWS: observations per program.
     """
     i = rows_of(count, ROWS)
     gaussian = i // views
@@ -75,7 +76,7 @@ def observe_rows(
 
 
 def observe(*inputs) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.observation`."""
+    """Kernel of the operator of :mod:`ghgs_lit.ops.observation`."""
     *tensors, scale, _ = inputs
     means = tensors[0]
     photo = tensors[5]

@@ -1,6 +1,7 @@
-"""Photo-consistency: how well the photographs agree at several depths of each pixel. A plane
-sweep (Collins, CVPR 1996) within each pixel's own bounds: a point on the surface has the same
-colour in all views."""
+"""Photo-consistency: agreement of the input views at several depths of each pixel.
+
+It is a plane sweep (Collins, CVPR 1996) within each pixel's own depth bounds, based on the assumption
+that a point on the surface has the same colour in all views."""
 
 import torch
 import torch.nn.functional as F
@@ -21,23 +22,23 @@ _SAMPLES = 1 << 22
 #: Mean absolute difference of two colours at which the consistency is 1 / e.
 TOLERANCE = 0.1
 
-#: Smallest cosine between the axes of two views that are compared (127 degrees): beyond it they
-#: hardly share any surface.
+#: Smallest cosine between the optical axes of two compared views (127 degrees): beyond it they hardly
+#: share any surface.
 WIDEST = -0.6
 
 
 @torch.no_grad()
 def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
-    """Agreement of each pixel of the subject with the best other view, without a gradient.
+    """Agreement of each foreground pixel with the best other view at S depths, without a gradient.
 
     Args:
-        batch: images, masks and cameras are read.
-        bounds: depths between which a pixel's point lies, in the unit of the cameras.
-        steps: S, the number of depths: the middles of S equal parts from near to far.
+        batch: provides images, masks and cameras.
+        bounds: near and far depth of each pixel, in the unit of the cameras.
+        steps: S, the number of depths: the centres of S equal intervals from near to far.
 
     Returns:
-        [B, V, S, H, W] in [0, 1]; 0 outside the subject,
-        and where no other view has the point in its mask.
+        [B, V, S, H, W] in [0, 1]; 0 in the background, and where no other view has the point in its
+        mask.
     """
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     agreement = consistency_of(batch, batch.pixels, near, far, steps)
@@ -49,21 +50,21 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
 def consistency_of(
     batch: Batch, pixels: Int[Tensor, " N"], near: Float[Tensor, " N"], far: Float[Tensor, " N"], steps: int
 ) -> Float[Tensor, "N S"]:
-    """:func:`photo_consistency` of some pixels of the subject.
+    """:func:`photo_consistency` of selected foreground pixels.
 
     Args:
-        batch: images, masks and cameras are read.
-        pixels: ascending indices [N] among those of all images.
-        near: least depth of each of these pixels [N], in the unit of the cameras.
-        far: largest depth of each [N].
-        steps: S, the number of depths: the middles of S equal parts from near to far.
+        batch: provides images, masks and cameras.
+        pixels: ascending indices [N] among the pixels of all images.
+        near: smallest depth of each of these pixels [N], in the unit of the cameras.
+        far: largest depth of each of these pixels [N].
+        steps: S, the number of depths: the centres of S equal intervals from near to far.
 
     Returns:
         [N, S] in [0, 1].
     """
     near = at_least_float32(near)
     far = at_least_float32(far)
-    # An error of half a pixel, as in bfloat16, would give another colour.
+    # Errors of half a pixel, as in bfloat16, would select another colour.
     with exact(batch.masks.device.type):
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
         colors = batch.once(_smooth if near.dtype == torch.float32 else _smooth_plainly).to(near)
@@ -86,15 +87,16 @@ def _swept(
     """:func:`consistency_of` in plain PyTorch.
 
     Args:
-        pixels: indices among those of all images.
-        near: least depths, in the unit of the cameras.
-        far: largest depths, the same.
-        colors: smoothed photographs and their masks (:func:`_smoothed`).
-        turn: matrices from pixels of a view (second axis) to another (third axis), as is the next.
-        shift: what is added in the other view.
+        pixels: indices among the pixels of all images.
+        near: smallest depths, in the unit of the cameras.
+        far: largest depths, in the unit of the cameras.
+        colors: smoothed images and their masks, from :func:`_smoothed`.
+        turn: matrices from pixels of a view (second axis) to another (third axis); see
+            :func:`_relations`.
+        shift: added in the other view; see :func:`_relations`.
         compared: whether two views are compared.
-        height: of an image, as is the next; kernels read it of flat colours.
-        width: of an image.
+        height: image height in pixels, used only by kernels, whose ``colors`` are flat.
+        width: image width in pixels, likewise.
         steps: S, the number of depths.
         tolerance: mean difference of colours at which the agreement is 1 / e.
 
@@ -124,20 +126,8 @@ def _best_match(
     compared: Bool[Tensor, "B V V"],
     tolerance: float,
 ) -> Float[Tensor, "n S"]:
-    """Agreement of pixels of any images, at their depths, with the best other view.
-
-    Args:
-        pixels: indices among those of all images.
-        depth: depths of each pixel that are tried.
-        colors: as for :func:`_swept`, as are the next.
-        turn: matrices from pixels of a view to another.
-        shift: what is added in the other view.
-        compared: whether two views are compared.
-        tolerance: mean difference of colours at which the agreement is 1 / e.
-
-    Returns:
-        [n, S] in [0, 1].
-    """
+    """Agreement [n, S] in [0, 1] of pixels at their depths with the best other view; arguments as in
+    :func:`_swept`."""
     views, _, height, width = colors.shape[1:]
     image = pixels // (height * width)
     place = pixels % (height * width)
@@ -165,11 +155,11 @@ def _match(
 
     Args:
         images: smoothed colours and masks of all m images [m, 4, H, W].
-        image: images that each pixel is compared with [n, o].
+        image: indices of the o images with which each pixel is compared [n, o].
         pixel_colors: colours of the pixels [n, 3].
-        rays: what a unit of depth adds to a point's homogeneous pixel in these images [n, o, 3].
-        shift: that of the camera's centre [n, o, 3].
-        depth: depths of each pixel that are tried [n, S].
+        rays: change of a point's homogeneous pixel in these images per unit of depth [n, o, 3].
+        shift: homogeneous pixel of the pixel's camera centre in these images [n, o, 3].
+        depth: depths of each pixel [n, S].
         tolerance: mean difference of colours at which the agreement is 1 / e.
 
     Returns:
@@ -195,16 +185,10 @@ def _smooth_plainly(batch: Batch) -> Tensor:
 def _smoothed(
     images: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 4 H W"]:
-    """Mean colours of the subject's pixels in 3 x 3, and the mask as a fourth channel.
+    """Mean colours of the foreground pixels in 3 x 3 windows, and the mask as a fourth channel,
+    [B, V, 4, H, W].
 
-    Pixels that are not finite are left out of the mask: they would spread through sums and samples.
-
-    Args:
-        images: colours of the surface [B, V, 3, H, W].
-        masks: of the subject [B, V, H, W].
-
-    Returns:
-        [B, V, 4, H, W].
+    Pixels that are not finite are removed from the mask: they would spread through sums and samples.
     """
     inside = (masks & images.sum(2).isfinite())[:, :, None]
     both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
@@ -215,7 +199,7 @@ def _smoothed(
 
 
 def _sum_of_three(values: Tensor, axis: int) -> Tensor:
-    """Sum of each value and its two neighbours along an axis, with 0 beyond the border."""
+    """Sum of each value and its two neighbours along an axis, with 0 outside."""
     sums = values.clone()
     inner = values.shape[axis] - 1
     sums.narrow(axis, 1, inner).add_(values.narrow(axis, 0, inner))
@@ -226,15 +210,15 @@ def _sum_of_three(values: Tensor, axis: int) -> Tensor:
 def _relations(
     intrinsics: Float[Tensor, "B V 3 3"], extrinsics: Float[Tensor, "B V 4 4"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What leads from pixels of a view j to those of a view k: ``z_k p_k = z_j turn p_j + shift``.
+    """Maps from pixels of a view j to pixels of a view k: ``z_k p_k = z_j turn p_j + shift``.
 
     Args:
-        intrinsics: K [B, V, 3, 3] in pixels.
+        intrinsics: K in pixels [B, V, 3, 3].
         extrinsics: world to camera [B, V, 4, 4].
 
     Returns:
-        ``turn`` [B, j, k, 3, 3], ``shift`` [B, j, k, 3],
-        and the cosines between the axes of views [B, j, k].
+        ``turn`` [B, j, k, 3, 3], ``shift`` [B, j, k, 3], and the cosines between the optical axes of
+        the views [B, j, k].
     """
     rotation = extrinsics[..., :3, :3]
     translation = extrinsics[..., :3, 3:]
@@ -244,7 +228,7 @@ def _relations(
     return turn, shift[..., 0], relative[..., 2, 2].clone()
 
 
-#: On a CPU, colours as one flat array, which :data:`_sweep` reads there.
+#: On a CPU, the colours are one flat array, the layout of the CPU kernel of :data:`_sweep`.
 _smoothing = Operator(
     "smoothed(Tensor images, Tensor masks) -> Tensor", _smoothed, __name__, {"cpu": everything}
 )

@@ -1,5 +1,5 @@
-"""Plane sweep of 16 pixels of four channels at once (see
-:mod:`ghgs_lit.ops.photo_consistency`)."""
+"""CPU kernels of the plane sweep, 16 pixels of four channels at once; see
+:mod:`ghgs_lit.ops.photo_consistency`."""
 
 import math
 from itertools import pairwise
@@ -26,17 +26,7 @@ def _vector(count: int) -> ir.VectorType:
 
 
 def _between(builder, low, high, share):
-    """``low + share (high - low)`` for vectors of any length.
-
-    Args:
-        builder: of LLVM instructions.
-        low: a vector, as is the next.
-        high: of the same length.
-        share: a number.
-
-    Returns:
-        The vector.
-    """
+    """Emit ``low + share (high - low)`` for two vectors of the same length and a number ``share``."""
     kind = low.type
     share = everywhere(builder, share, low.type.count)
     function = ir.FunctionType(kind, [kind] * 3)
@@ -46,17 +36,17 @@ def _between(builder, low, high, share):
 
 @intrinsic
 def interpolate(typing_context, pixels, at, line, right, down, out, place):
-    """Write the bilinear interpolation of four pixels; the two pixels of a line are loaded at once.
+    """Write the bilinear interpolation of four pixels; the two pixels of a row are loaded at once.
 
     Args:
         typing_context: Numba's.
         pixels: flat array of pixels, channels innermost.
-        at: where the first pixel is in it.
-        line: how many numbers later the pixel below it is.
+        at: offset of the upper left pixel.
+        line: distance to the pixel below it, in numbers.
         right: weight of the pixels to the right, in [0, 1].
         down: weight of the pixels below, in [0, 1].
-        out: array for the channels of the result.
-        place: where they start in it, a multiple of :data:`CHANNELS`.
+        out: written, the channels of the result.
+        place: offset in ``out``, a multiple of :data:`CHANNELS`.
     """
 
     def emit(context, builder, sig, args):
@@ -82,12 +72,12 @@ def interpolate(typing_context, pixels, at, line, right, down, out, place):
 
 @intrinsic
 def channels_of(typing_context, pixels, at):
-    """The channels of 16 pixels, one vector per channel.
+    """Load 16 pixels as one vector per channel.
 
     Args:
         typing_context: Numba's.
         pixels: flat array of pixels, channels innermost.
-        at: where the first pixel is in it.
+        at: offset of the first pixel.
 
     Returns:
         :data:`CHANNELS` vectors.
@@ -107,15 +97,15 @@ def channels_of(typing_context, pixels, at):
 
 @intrinsic
 def store_places(typing_context, places, at, row, column, line):
-    """Write the indices of the first channels of 16 pixels.
+    """Write the offsets of 16 pixels in a flat image with channels innermost.
 
     Args:
         typing_context: Numba's.
-        places: int32 array for the indices.
-        at: where they start in it.
-        row: vector of whole rows, as floats.
-        column: vector of whole columns, as floats.
-        line: numbers in a row of pixels.
+        places: written, int32.
+        at: position in ``places``.
+        row: vector of rows, integers stored as floats.
+        column: vector of columns, integers stored as floats.
+        line: number of values in a row of pixels.
     """
 
     def emit(context, builder, sig, args):
@@ -144,10 +134,10 @@ def smooth_rows(photo, masks, out, image, first, last):
     Args:
         photo: colours of all images [m, 3, H, W].
         masks: [m, H, W].
-        out: the flat array, zeros at first.
-        image: number of the image.
+        out: written, the flat array, initially zeros.
+        image: index of the image.
         first: first row.
-        last: row after the last one.
+        last: end of the rows, excluded.
     """
     height = masks.shape[1]
     width = masks.shape[2]
@@ -193,18 +183,18 @@ def _rays(turn, u, v):
 def _project(rays, shift, depth, height, width, places, rights, downs):
     """Project points of rays into an image.
 
-    Points outside the image or behind the camera, and NaN, are put into the rim,
-    where the mask is 0.
+    Points outside the image or behind the camera, and NaN, are moved to the image's rim, where the
+    mask is 0.
 
     Args:
-        rays: what a unit of depth adds to the homogeneous pixel: three vectors.
-        shift: that of the camera's centre [3].
+        rays: change of the homogeneous pixel per unit of depth, three vectors.
+        shift: homogeneous pixel of the rays' origin [3].
         depth: vector of depths.
-        height: of the image, as is the next.
-        width: of the image.
-        places: int32 array [16] for the indices of the pixels to the upper left.
-        rights: array [16] for the weights of the next pixels to the right.
-        downs: array [16] for those of the pixels below.
+        height: image height in pixels.
+        width: image width in pixels.
+        places: written, offsets of the upper left pixels, int32 [16].
+        rights: written, weights of the pixels to the right [16].
+        downs: written, weights of the pixels below [16].
     """
     z = simd.fma(rays[2], depth, shift[2])
     inverse = ONE / z
@@ -227,20 +217,20 @@ def _difference(first, second):
 
 @helper
 def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, values, centers):
-    """Load 16 pixels; the last one fills up the vectors.
+    """Load 16 pixels, padded with the last one.
 
     Args:
-        colors: all views, of :func:`smoothed`.
-        pixels: indices among those of all images.
-        near: least depth of each.
-        far: largest depth of each.
-        start: number of the first of the 16 pixels.
-        last: number after the last pixel.
-        height: of the image, as is the next.
-        width: of the image.
-        begin: where the pixels' image starts in ``colors``.
-        values: array [4 * 16] for u and v of the centres, near, and far - near.
-        centers: array [16 * 4] for the colours.
+        colors: all views, from :func:`smoothed`.
+        pixels: indices among the pixels of all images.
+        near: smallest depth of each pixel.
+        far: largest depth of each pixel.
+        start: first of the 16 pixels.
+        last: end of the pixels, excluded.
+        height: image height in pixels.
+        width: image width in pixels.
+        begin: offset of the pixels' image in ``colors``.
+        values: written, u and v of the centres, near, and far - near [4 * 16].
+        centers: written, the colours [16 * 4].
     """
     for lane in range(LANES):
         i = min(start + lane, last - 1)
@@ -262,21 +252,21 @@ def sweep_pixels(
     """Write the agreement of some pixels of an image; see :func:`swept`.
 
     Args:
-        colors: all views, of :func:`smoothed`.
-        pixels: ascending indices among those of all images [N].
-        near: least depth of each [N].
-        far: largest depth of each [N].
+        colors: all views, from :func:`smoothed`.
+        pixels: ascending indices among the pixels of all images [N].
+        near: smallest depth of each pixel [N].
+        far: largest depth of each pixel [N].
         turn: matrices from pixels of a view (second axis) to another (third axis) [B, V, V, 3, 3].
-        shift: what is added in the other view [B, V, V, 3].
+        shift: added in the other view [B, V, V, 3].
         compared: whether two views are compared [B, V, V].
-        shares: fractions of the way from near to far [S].
+        shares: depths as fractions of the interval from near to far [S].
         tolerance: mean difference of colours at which the agreement is 1 / e.
-        out: array [N, S] for the agreement.
-        height: of an image, as is the next.
-        width: of an image.
-        image: number of the pixels' image.
-        first: number of the first pixel.
-        last: number after the last one.
+        out: written, the agreement [N, S].
+        height: image height in pixels.
+        width: image width in pixels.
+        image: index of the pixels' image.
+        first: first pixel.
+        last: end of the pixels, excluded.
     """
     views = turn.shape[1]
     element = image // views
@@ -327,15 +317,15 @@ _ROWS = 64  #: Rows of an image in one task
 
 
 def smoothed(photo: Tensor, masks: Tensor) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.photo_consistency`, as one flat array.
+    """Kernel of the operator ``smoothed`` of :mod:`ghgs_lit.ops.photo_consistency`.
 
     Args:
         photo: colours of the surface [B, V, 3, H, W].
-        masks: of the subject [B, V, H, W].
+        masks: foreground [B, V, H, W].
 
     Returns:
-        Channels are innermost. A rim of zeros surrounds each photograph, and the end is padded for
-        reads of whole vectors.
+        A flat array with channels innermost, in which a rim of zeros surrounds each image; the end is
+        padded for reads of whole vectors.
     """
     elements, views, height, width = masks.shape
     flat = photo.new_zeros(elements * views * (height + 2) * (width + 2) * 4 + LANES)
@@ -349,18 +339,18 @@ def swept(
     pixels: Tensor, near: Tensor, far: Tensor, colors: Tensor, turn: Tensor, shift: Tensor,
     compared: Tensor, height: int, width: int, steps: int, tolerance: float,
 ) -> Tensor:  # fmt: skip
-    """The operator of :mod:`ghgs_lit.ops.photo_consistency`.
+    """Kernel of the operator ``swept`` of :mod:`ghgs_lit.ops.photo_consistency`.
 
     Args:
-        pixels: ascending indices among those of all images [N].
-        near: least depth of each [N].
-        far: largest depth of each [N].
-        colors: all views, of :func:`smoothed`.
+        pixels: ascending indices among the pixels of all images [N].
+        near: smallest depth of each pixel [N].
+        far: largest depth of each pixel [N].
+        colors: all views, from :func:`smoothed`.
         turn: matrices from pixels of a view to another [B, V, V, 3, 3].
-        shift: what is added in the other view [B, V, V, 3].
+        shift: added in the other view [B, V, V, 3].
         compared: whether two views are compared [B, V, V].
-        height: of an image, as is the next.
-        width: of an image.
+        height: image height in pixels.
+        width: image width in pixels.
         steps: S, the number of depths.
         tolerance: mean difference of colours at which the agreement is 1 / e.
 

@@ -1,5 +1,4 @@
-"""Photo-consistency for a GPU, in Triton: formulas of
-:mod:`ghgs_lit.ops.photo_consistency`."""
+"""Triton kernel of photo-consistency; the formulas are in :mod:`ghgs_lit.ops.photo_consistency`."""
 
 import triton
 import triton.language as tl
@@ -13,24 +12,24 @@ def swept_rows(
     count, pixels, near, far, colors, turn, shift, compared, out, steps, views, height, width, tolerance,
     ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write the agreement of ``ROWS`` pixels at depths.
+    """Write ``ROWS`` values of agreement, each of a pixel at a depth.
 
     Args:
         count: pixels times depths, N S.
-        pixels: indices among those of all images [N].
-        near: least depth of each [N].
-        far: largest depth of each [N].
-        colors: smoothed photographs and their masks [B, V, 4, H, W].
+        pixels: indices among the pixels of all images [N].
+        near: smallest depth of each pixel [N].
+        far: largest depth of each pixel [N].
+        colors: smoothed images and their masks [B, V, 4, H, W].
         turn: matrices from pixels of a view (second axis) to another (third axis) [B, V, V, 3, 3].
-        shift: what is added in the other view [B, V, V, 3].
+        shift: added in the other view [B, V, V, 3].
         compared: whether two views are compared [B, V, V].
-        out: for the agreement [N, S].
+        out: written, the agreement [N, S].
         steps: S.
         views: V.
         height: H.
         width: W.
         tolerance: mean difference of colours at which the agreement is 1 / e.
-        ROWS: rows of a program.
+        ROWS: rows per program.
     """
     i = rows_of(count, ROWS)
     n = i // steps
@@ -80,7 +79,7 @@ def swept_rows(
 
 
 def swept(*inputs) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.photo_consistency`."""
+    """Kernel of the operator ``swept`` of :mod:`ghgs_lit.ops.photo_consistency`."""
     *tensors, height, width, steps, tolerance = inputs
     pixels, near, _, colors = tensors[:4]
     views = colors.shape[1]

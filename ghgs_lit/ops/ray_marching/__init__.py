@@ -1,5 +1,6 @@
-"""Search along rays for the first and the last depth that other views allow; on a CPU each ray ends as
-soon as its result is known."""
+"""Search along rays for the first and the last depth that the other views allow.
+
+On a CPU, the search along a ray stops as soon as its result is known."""
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -10,8 +11,7 @@ from ghgs_lit.geometry.constants import constant, other_images
 from ghgs_lit.ops.dispatch import Operator, everything
 from ghgs_lit.ops.pool import at_once, even_parts
 
-#: The smallest depth in metres at which masks are looked up;
-#: points behind the camera are moved there.
+#: Smallest depth in metres at which masks are looked up; points behind the camera are moved there.
 NEAREST = 1e-4
 #: Depths in memory at once, on a CPU and elsewhere.
 _DEPTHS = 1 << 18, 1 << 23
@@ -20,23 +20,23 @@ _DEPTHS = 1 << 18, 1 << 23
 def look_up(
     tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], pixels: Float[Tensor, "3 ..."]
 ) -> Tensor:
-    """Entries of tables at homogeneous pixels.
+    """Look up entries of tables at homogeneous pixels.
 
-    Points outside the frame take the entry of the nearest border pixel: a mask that does not
-    touch the border has the whole subject in its frame, and :func:`votes_outside` says what the
-    others know. Points behind the camera land far outside the frame.
+    Points outside the frame get the entry of the nearest border pixel: a mask that does not touch the
+    border contains the whole subject; for other masks see :func:`votes_outside`. Points behind the
+    camera are projected far outside the frame.
 
     Args:
-        tables: of votes or other values.
-        image: which table; broadcasts with the pixels.
-        pixels: the three coordinates of each; overwritten.
+        tables: votes or other values.
+        image: index of the table; broadcasts with the pixels.
+        pixels: the three homogeneous coordinates of each pixel; overwritten.
 
     Returns:
-        Entries of the shape that ``image`` and the pixels broadcast to.
+        Entries of the shape to which ``image`` and the pixels broadcast.
     """
     height, width = tables.shape[1:]
     inverse = pixels[2].clamp_(min=NEAREST).reciprocal_()
-    # Cameras of absurd sizes overflow to NaN, which has no index.
+    # Extreme camera parameters overflow to NaN, which cannot be an index.
     places = pixels[:2].mul_(inverse).nan_to_num_().clamp_(min=0)
     last = constant(torch.tensor, (width - 1, height - 1), like=pixels)
     column, row = torch.minimum(places, last.view(2, *[1] * (pixels.dim() - 1))).int()
@@ -57,23 +57,24 @@ def _marched(
     rays: Int[Tensor, " r"] | None,
     count: int | None,
 ) -> tuple[Tensor, Tensor]:
-    """Bounds that the other views allow; unchanged where there are none.
+    """Narrow depth bounds to what the other views allow; unchanged where they allow no sampled depth.
 
     Args:
-        masks: the subject's pixels, whose rays are marched.
+        masks: foreground pixels, whose rays are marched.
         outside: 1 where a view votes "outside".
-        matrices: of projection.
-        directions: of the rays.
-        centers: of the cameras.
-        near: depths in metres from which others are tried.
-        far: depths in metres up to which others are tried.
-        steps: fractions of the way from near to far that are tried.
-        tolerance: votes that an allowed depth may have.
-        rays: indices of the masks' pixels; None: they are found.
-        count: the masks have no more pixels than this; None: unknown.
+        matrices: projection matrices.
+        directions: directions of the rays.
+        centers: camera centres.
+        near: near bounds in metres.
+        far: far bounds in metres.
+        steps: sampled depths as fractions of the interval from near to far.
+        tolerance: largest number of votes against an allowed depth.
+        rays: indices of the foreground pixels; None: derived from ``masks``.
+        count: upper bound of the number of foreground pixels; None: unknown.
 
     Returns:
-        Near and far [B, V, h, w] in metres, half a step outside the depths that were tried.
+        Near and far bounds in metres [B, V, h, w], half a step outside the first and the last allowed
+        sample.
     """
     views = outside.shape[1]
     samples = len(steps)

@@ -1,5 +1,7 @@
-"""Votes of the views about depths along rays, on a CPU. The arithmetic is that of the plain form, so that
-bits agree where processors round products and sums once."""
+"""CPU kernel of the search along rays.
+
+The arithmetic is that of the plain version, so that results agree bitwise on processors with fused
+multiply-add."""
 
 import numpy as np
 import torch
@@ -23,20 +25,14 @@ _MAPS = (VOTES, MASKS, FLOATS[4], FLOATS[5], FLOATS[3], FLOATS[4], FLOATS[4], FL
 
 @helper
 def _vote(table, x, y, w):
-    """Entry at a homogeneous pixel; see :func:`ghgs_lit.ops.ray_marching.look_up`.
-
-    Args:
-        table: votes of a view.
-        x: first coordinate, as are the others homogeneous.
-        y: second one.
-        w: third one.
-    """
+    """Entry of a view's table at the homogeneous pixel (x, y, w); see
+    :func:`ghgs_lit.ops.ray_marching.look_up`."""
     inverse = ONE / (LEAST if w < LEAST else w)
     column = x * inverse
     row = y * inverse
     right = np.float32(table.shape[1] - 1)
     bottom = np.float32(table.shape[0] - 1)
-    # Comparisons with NaN are false, so it becomes 0.
+    # Comparisons with NaN are false, so NaN becomes 0.
     column = (right if column > right else column) if column > ZERO else ZERO
     row = (bottom if row > bottom else row) if row > ZERO else ZERO
     # Unsigned: Numba checks the sign of a signed index.
@@ -45,28 +41,23 @@ def _vote(table, x, y, w):
 
 @helper
 def _fused(start, length, slope):
-    """``start + length * slope``, rounded once as ``torch.addcmul`` does where processors can.
-
-    Args:
-        start: float32, as are the others.
-        length: factor.
-        slope: factor.
-    """
+    """``start + length * slope`` of float32 numbers, rounded once like ``torch.addcmul`` on processors with
+    fused multiply-add."""
     return np.float32(np.float64(start) + np.float64(length) * np.float64(slope))
 
 
 @helper
 def _allowed(outside, element, view, origin, along, depth, tolerance):
-    """Whether at most ``tolerance`` other views place a point of a ray outside.
+    """Whether at most ``tolerance`` other views vote "outside" for a point of a ray.
 
     Args:
         outside: votes of all views.
-        element: of the batch.
-        view: of the ray, which does not vote.
-        origin: homogeneous pixels of the ray's camera in all views, [V, 3].
-        along: what is added to them for each metre of depth, [V, 3].
-        depth: of the point in metres.
-        tolerance: votes that it may have.
+        element: batch element.
+        view: view of the ray, which does not vote.
+        origin: homogeneous pixels of the ray's camera centre in all views [V, 3].
+        along: change of these pixels per metre of depth [V, 3].
+        depth: depth of the point in metres.
+        tolerance: largest number of votes against an allowed depth.
     """
     votes = 0
     for u in range(len(origin)):
@@ -92,19 +83,19 @@ def march_rows(
     """Narrow the bounds of some rows of a view; see :func:`march`.
 
     Args:
-        outside: votes of all views, [B, V, h, w], as are the masks.
-        masks: the subject's pixels.
-        matrices: of projection, [B, V, 3, 4].
-        directions: of rays, [B, V, h, w, 3].
-        centers: of cameras, [B, V, 3].
-        near: bounds in metres, [B, V, h, w], as is ``far``; overwritten.
-        far: overwritten.
-        steps: fractions of the way from near to far.
-        tolerance: votes that an allowed depth may have.
-        element: of the batch.
-        view: of the rows.
+        outside: votes of all views [B, V, h, w].
+        masks: foreground pixels [B, V, h, w].
+        matrices: projection matrices [B, V, 3, 4].
+        directions: directions of rays [B, V, h, w, 3].
+        centers: camera centres [B, V, 3].
+        near: near bounds in metres [B, V, h, w]; overwritten.
+        far: far bounds in metres [B, V, h, w]; overwritten.
+        steps: sampled depths as fractions of the interval from near to far.
+        tolerance: largest number of votes against an allowed depth.
+        element: batch element.
+        view: view of the rows.
         first: first row.
-        last: the row after the last one.
+        last: end of the rows, excluded.
     """
     views = masks.shape[1]
     samples = len(steps)
@@ -156,7 +147,7 @@ def march(
     rays: Tensor | None,
     count: int | None,
 ) -> tuple[Tensor, Tensor]:
-    """Bounds of the rays of the masks; ``rays`` and ``count`` are not read."""
+    """Kernel of the operator of :mod:`ghgs_lit.ops.ray_marching`; ``rays`` and ``count`` are unused."""
     elements, views, height, _ = masks.shape
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (near, far))
     tables = (outside, masks, matrices, directions, centers, near, far, steps)

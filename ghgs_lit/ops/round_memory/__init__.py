@@ -1,7 +1,7 @@
-"""The memory of the rounds: two small networks of what each Gaussian's views show.
+"""Recurrent memory of the refinement rounds: two small MLPs on the observations of each Gaussian.
 
-A network runs for each view; between its layers hundreds of megabytes would be written and read
-again for eight people. Kernels keep them in registers or in the cache."""
+The first MLP runs for every view; for eight people, its hidden layers would write and read hundreds of
+megabytes. Kernels keep them in registers or in the cache."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +16,7 @@ from ghgs_lit.geometry.precision import rounds_products
 from ghgs_lit.ops.dispatch import LIBRARY, Operator
 from ghgs_lit.ops.pool import at_once, even_parts, multiplies
 
-#: Gaussians at once that fit a CPU's cache, in half the time.
+#: Number of Gaussians per part on a CPU: a part fits the cache, which halves the time.
 _AT_ONCE = 2048
 
 
@@ -26,25 +26,28 @@ def remembered(
     known: Float[Tensor, "N k"],
     memory: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
-    """The new memory of each Gaussian, from what is seen and known.
+    """Update the memory of each Gaussian.
 
     Args:
-        layers: two of the views, two of the update, and the last one.
-        each: observations of each view, the own one first; two or more.
-        known: what is known of each Gaussian beside them.
-        memory: of the rounds before.
+        layers: two layers of the view MLP, two of the update MLP, and the output layer.
+        each: observations in V >= 2 views, the Gaussian's own view first.
+        known: additional inputs of each Gaussian.
+        memory: memory of the previous rounds.
+
+    Returns:
+        The new memory [N, h].
     """
     return _remember(each, known, memory, [x for layer in layers for x in (layer.weight, layer.bias)])
 
 
 def plain(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[Tensor]) -> Tensor:
-    """The operator in plain PyTorch, without a gradient in parts.
+    """The operator in plain PyTorch; without a gradient, Gaussians are processed in parts.
 
     Args:
-        each: observations of each view [N, V, c].
-        known: beside them [N, k].
-        memory: of the rounds before [N, h].
-        weights: weights and biases of the five layers, in turn.
+        each: observations in each view [N, V, c].
+        known: additional inputs [N, k].
+        memory: memory of the previous rounds [N, h].
+        weights: weights and biases of the five layers, alternating.
     """
     count = len(each)
     most = count if torch.is_grad_enabled() else at_once(each.device, _AT_ONCE, count)
@@ -59,13 +62,13 @@ def _remembered(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[T
 
 
 def _two_layers(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
-    """Two layers with their weights and biases in turn, each with a rectifier in place."""
+    """Apply two linear layers, given by alternating weights and biases, each followed by a ReLU."""
     x = F.relu_(F.linear(x, *weights[:2]))
     return F.relu_(F.linear(x, *weights[2:]))
 
 
 def _fits_gpu(*inputs: Any) -> bool:
-    """Without a gradient, where products round to TF32."""
+    """Whether the kernel supports the inputs: TF32 products, no autocast, no gradient."""
     kind = inputs[0].device.type
     is_rounding = rounds_products(kind) and not torch.is_autocast_enabled(kind)
     return is_rounding and not torch.is_grad_enabled()
@@ -87,7 +90,7 @@ def _save(ctx: Any, inputs: tuple, output: Tensor) -> None:
 
 @torch.autograd.function.once_differentiable
 def _back(ctx: Any, slopes: Tensor) -> tuple:
-    """Gradients of the memory before and of the layers; observations need none."""
+    """Gradients of the previous memory and of the layers; observations need none."""
     from ghgs_lit.ops.round_memory.gradients import gradients  # here: it loads a compiler
 
     return None, None, *gradients(ctx.saved_tensors[:4], ctx.saved_tensors[4:], slopes)

@@ -1,4 +1,4 @@
-"""The kernel of the rounds' memory."""
+"""CPU kernel of the memory of the refinement rounds."""
 
 import numpy as np
 import torch
@@ -15,14 +15,14 @@ ONE = np.float32(1)
 
 @helper
 def see(view, hidden, views, shown, seen):
-    """Add a view's values to those of the own view, the others' mean and the others' maximum.
+    """Accumulate a view in the values of the own view, the mean and the maximum of the other views.
 
     Args:
-        view: number of the view, 0 is the own one; called in their order.
+        view: index of the view, where 0 is the own view; call in ascending order.
         hidden: channels of a view.
         views: number of views.
         shown: values of the view, ``hidden`` lines of ``PANEL`` floats.
-        seen: written or added to, 3 ``hidden`` lines.
+        seen: accumulated, 3 ``hidden`` lines.
     """
     size = hidden * PANEL
     share = ONE / np.float32(views - 1)
@@ -44,11 +44,11 @@ def remember_rows(each, known, before, layers, after, first, last):
     """Write rows of the new memory; see :mod:`ghgs_lit.ops.round_memory`.
 
     Args:
-        each: [N, V, c], observations of each view, the own one first.
-        known: [N, k], what is known of each Gaussian beside them.
-        before: [N, h], memory of the rounds before.
+        each: observations in each view, the own view first [N, V, c].
+        known: additional inputs of each Gaussian [N, k].
+        before: memory of the previous rounds [N, h].
         layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
-        after: [N, h], written in these rows.
+        after: written in these rows [N, h].
         first: first row.
         last: end of the rows, excluded.
     """
@@ -90,20 +90,13 @@ def remember_rows(each, known, before, layers, after, first, last):
                 after[start + lane, channel] = one[channel * PANEL + lane]
 
 
-#: Gaussians in one task, and the work of one as the pool counts it.
+#: Gaussians in one task, and the work of a Gaussian in the unit of :func:`ghgs_lit.ops.pool.run`.
 _TASK = 512
 WORK = 8
 
 
 def remember(each: Tensor, known: Tensor, before: Tensor, weights: list[Tensor]) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.round_memory`.
-
-    Args:
-        each: observations of each view [N, V, c].
-        known: beside them [N, k].
-        before: memory of the rounds before [N, h].
-        weights: weights and biases of the five layers, in turn.
-    """
+    """Kernel of the operator of :mod:`ghgs_lit.ops.round_memory`; see its ``plain``."""
     after = torch.empty_like(before, memory_format=torch.contiguous_format)
     rows = [x.detach().contiguous().numpy() for x in (each, known, before)]
     given = (*rows, packed(weights), after.numpy())

@@ -1,4 +1,4 @@
-"""The kernel of the rounds' memory for a GPU, in Triton: a row is a Gaussian."""
+"""Triton kernel of the memory of the refinement rounds; a row is a Gaussian."""
 
 import torch
 import triton
@@ -10,15 +10,15 @@ from ghgs_lit.ops.tiles import rows_of, tanh
 
 @triton.jit
 def part_of(table, row, first, count, length, COLUMNS: tl.constexpr):
-    """Part of rows of a table, 0 beyond it.
+    """Load some columns of rows of a table, padded with 0.
 
     Args:
         table: pointer to a contiguous table of ``length`` columns.
-        row: [ROWS].
-        first: column of the part.
-        count: number of its columns.
+        row: indices of rows [ROWS].
+        first: first column.
+        count: number of columns to load.
         length: number of columns of the table.
-        COLUMNS: of the result, a power of two.
+        COLUMNS: columns of the result, a power of two.
 
     Returns:
         Values [ROWS, COLUMNS].
@@ -31,17 +31,17 @@ def part_of(table, row, first, count, length, COLUMNS: tl.constexpr):
 def times(
     x, weight, first, count, length, top, outputs, INPUTS: tl.constexpr, OUTPUTS: tl.constexpr
 ):  # fmt: skip
-    """Product of rows with a part of the weight of a linear layer.
+    """Multiply rows with a part of the weight of a linear layer.
 
     Args:
-        x: [ROWS, INPUTS], 0 from ``count`` on.
+        x: [ROWS, INPUTS], 0 from column ``count`` on.
         weight: pointer to [outputs, length].
-        first: column of the part.
-        count: number of its columns.
+        first: first column of the part.
+        count: number of columns of the part.
         length: inputs of the layer.
-        top: row of the part.
-        outputs: of the layer.
-        INPUTS: ``count`` or more, a power of two.
+        top: first row of the part.
+        outputs: outputs of the layer.
+        INPUTS: a power of two, at least ``count``.
         OUTPUTS: rows of the part, a power of two.
 
     Returns:
@@ -56,21 +56,14 @@ def times(
 
 @triton.jit
 def biases(bias, top, outputs, OUTPUTS: tl.constexpr):
-    """Part of a bias as a row [1, OUTPUTS].
-
-    Args:
-        bias: [outputs] numbers.
-        top: the first one that is read.
-        outputs: their number; beyond them the row is 0.
-        OUTPUTS: length of the row, a power of two.
-    """
+    """Part of a bias [outputs] from ``top`` on, as a row [1, OUTPUTS] padded with 0."""
     column = top + tl.arange(0, OUTPUTS)
     return tl.load(bias + column, mask=column < outputs, other=0.0)[None]
 
 
 @triton.jit
 def positive(x):
-    """Numbers above 0; what is not a number stays so, as in PyTorch."""
+    """ReLU; NaN stays NaN, as in PyTorch."""
     return tl.where(x < 0, 0.0, x)
 
 
@@ -78,19 +71,19 @@ def positive(x):
 def seen_by(
     each, row, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS: tl.constexpr, HIDDEN: tl.constexpr
 ):
-    """What the network of the views makes of observations: [ROWS, HIDDEN].
+    """Apply the view MLP to observations, giving [ROWS, HIDDEN].
 
     Args:
         each: pointer to observations [rows, channels].
-        row: [ROWS].
-        view_0: weight of the first layer, [hidden, channels].
-        bias_0: of the first layer.
-        view_1: weight of the second layer, [hidden, hidden].
-        bias_1: of the second layer.
-        channels: of observations.
-        hidden: width.
-        CHANNELS: ``channels`` or more.
-        HIDDEN: ``hidden`` or more.
+        row: indices of rows [ROWS].
+        view_0: weight of the first layer [hidden, channels].
+        bias_0: bias of the first layer [hidden].
+        view_1: weight of the second layer [hidden, hidden].
+        bias_1: bias of the second layer [hidden].
+        channels: channels of an observation.
+        hidden: width of the MLP.
+        CHANNELS: a power of two, at least ``channels``.
+        HIDDEN: a power of two, at least ``hidden``.
     """
     x = part_of(each, row, 0, channels, channels, CHANNELS)
     x = times(x, view_0, 0, channels, channels, 0, hidden, CHANNELS, HIDDEN)
@@ -105,41 +98,42 @@ def remember_rows(
     bias_4, out, views, channels, hidden, more, wide, CHANNELS: tl.constexpr, HIDDEN: tl.constexpr,
     MORE: tl.constexpr, WIDE: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write the memory of ``ROWS`` Gaussians.
+    """Write the new memory of ``ROWS`` Gaussians.
 
     Args:
         count: number N of Gaussians.
-        each: [N, views, channels], observations.
-        known: [N, more].
-        memory: [N, hidden], before.
-        view_0: weight [hidden, channels], as are the next ones with their biases.
+        each: observations [N, views, channels].
+        known: additional inputs [N, more].
+        memory: memory of the previous rounds [N, hidden].
+        view_0: weight of the first layer of the view MLP [hidden, channels].
         bias_0: [hidden].
-        view_1: [hidden, hidden].
+        view_1: weight of its second layer [hidden, hidden].
         bias_1: [hidden].
-        update_0: [wide, 4 hidden + more]: of the own view, the mean and the largest of the others,
-            what is known, the memory.
+        update_0: weight of the first layer of the update MLP [wide, 4 hidden + more], whose inputs are
+            the own view, the mean and the maximum of the other views, the additional inputs, and the
+            memory.
         bias_2: [wide].
-        update_1: [hidden, wide].
+        update_1: weight of its second layer [hidden, wide].
         bias_3: [hidden].
-        last: [hidden, hidden].
+        last: weight of the output layer [hidden, hidden].
         bias_4: [hidden].
-        out: [N, hidden], written.
-        views: of a Gaussian, 2 or more.
-        channels: of an observation.
+        out: written [N, hidden].
+        views: views of a Gaussian, at least 2.
+        channels: channels of an observation.
         hidden: width of the memory.
-        more: values that are known.
-        wide: width of the update.
-        CHANNELS: powers of two that hold these, as are the next ones.
-        HIDDEN: of ``hidden``.
-        MORE: of ``more``.
-        WIDE: values of the update that are computed together.
-        ROWS: Gaussians of a program.
+        more: number of additional inputs.
+        wide: width of the update MLP.
+        CHANNELS: a power of two, at least ``channels``.
+        HIDDEN: a power of two, at least ``hidden``.
+        MORE: a power of two, at least ``more``.
+        WIDE: channels of the update MLP that are computed together.
+        ROWS: Gaussians per program.
     """
     i = rows_of(count, ROWS)
     length = 4 * hidden + more
     own = seen_by(each, i * views, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS, HIDDEN)
     mean = tl.zeros_like(own)
-    most = tl.zeros_like(own)  # no value is negative
+    most = tl.zeros_like(own)  # values are not negative
     for view in range(1, views):
         row = i * views + view
         x = seen_by(each, row, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS, HIDDEN)
@@ -163,22 +157,12 @@ def remember_rows(
     tl.store(out + i[:, None] * hidden + column, tanh(before + x), mask=column < hidden)
 
 
-#: Gaussians of a program: their values and a part of a weight fit into registers.
+#: Gaussians per program: their values and a part of a weight fit into registers.
 _TOGETHER = 32
 
 
 def remember(each: Tensor, known: Tensor, memory: Tensor, weights: list[Tensor]) -> Tensor:
-    """The operator of :mod:`ghgs_lit.ops.round_memory`.
-
-    Args:
-        each: observations of each view [N, V, c].
-        known: beside them [N, k].
-        memory: of the rounds before [N, h].
-        weights: weights and biases of the five layers, in turn.
-
-    Returns:
-        The new memory [N, h].
-    """
+    """Kernel of the operator of :mod:`ghgs_lit.ops.round_memory`; see its ``plain``."""
     count, views, channels = each.shape
     out = torch.empty_like(memory, memory_format=torch.contiguous_format)
     numbers = (channels, memory.shape[1], known.shape[1], len(weights[4]))

@@ -1,5 +1,4 @@
-"""Gradients of the memory of rounds; values of inner layers are computed again,
-which stays in the cache."""
+"""CPU kernel of the gradients of the rounds' memory; it recomputes hidden layers, within the cache."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -32,15 +31,15 @@ _LAYERS = (FLOATS[1], FLOATS[1], types.Array(types.int64, 2, "C"), FLOATS[1])
 
 @helper
 def _unsee(view, hidden, views, shown, seen, slopes, own):
-    """Write the gradient of a view's values; of equal maxima the first view gets the gradient.
+    """Write the gradient of a view's values; of equal maxima, the first view gets the gradient.
 
     Args:
-        view: number of the view, 0 is the own one.
+        view: index of the view, where 0 is the own view.
         hidden: channels of a view.
         views: number of views.
         shown: values of the view, lines of ``PANEL`` floats.
-        seen: values of the own view, mean and maximum of the others.
-        slopes: gradients of ``seen``; of a maximum that is given to this view it becomes 0.
+        seen: values of the own view, mean and maximum of the other views.
+        slopes: gradients of ``seen``; the gradient of a maximum is set to 0 once a view has received it.
         own: written, gradients of ``shown``.
     """
     size = hidden * PANEL
@@ -66,16 +65,7 @@ def _of(view, views, buffer):
 
 @helper
 def _layer(layers, place, outputs, inputs, before, after):
-    """``after = max(W before + b, 0)``, and a line of ones below.
-
-    Args:
-        layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
-        place: where the layer begins.
-        outputs: channels of ``after``.
-        inputs: channels of ``before``.
-        before: lines of ``PANEL`` floats.
-        after: written.
-    """
+    """Compute ``after = max(W before + b, 0)`` of a packed layer, followed by a line of ones."""
     linear(layers, place, outputs, inputs, before, after)
     rectify(layers, place, outputs, inputs, after)
     put_ones(outputs, after)
@@ -83,23 +73,24 @@ def _layer(layers, place, outputs, inputs, before, after):
 
 @helper
 def _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow):
-    """Compute the inputs of all layers: two of each view, two of the update and the last one.
+    """Recompute the inputs of all five layers for ``count`` rows, 1 to ``PANEL``.
+
+    All written buffers are lines of ``PANEL`` floats.
 
     Args:
-        each: [N, V, c], observations of each view, the own one first.
-        known: [N, k], what is known of each Gaussian beside them.
-        before: [N, h], memory of the rounds before.
+        each: observations in each view, the own view first [N, V, c].
+        known: additional inputs of each Gaussian [N, k].
+        before: memory of the previous rounds [N, h].
         layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
-        places: [layers + 1, 3], of :class:`ghgs_lit.ops.layers.Sums`.
+        places: [layers + 1, 3]; see :class:`ghgs_lit.ops.layers.Sums`.
         start: first row.
-        count: number of rows, 1 to ``PANEL``.
-        given: written, observations of each view in lines of ``PANEL`` floats,
-            as are all that follow.
-        one: written, results of the first layer of each view.
-        two: written, results of the second layer of each view.
-        seen: written, inputs of the update.
-        up: written, results of its first layer.
-        narrow: written, results of its second layer.
+        count: number of rows.
+        given: written, observations in each view.
+        one: written, outputs of the first layer of each view.
+        two: written, outputs of the second layer of each view.
+        seen: written, inputs of the update MLP.
+        up: written, outputs of its first layer.
+        narrow: written, outputs of its second layer.
     """
     views = each.shape[1]
     channels = each.shape[2]
@@ -126,20 +117,20 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
 def remember_back(
     each, known, before, after, slopes, layers, backs, places, sums, d_before, first, last
 ):  # fmt: skip
-    """Write gradients of the memory before, and add those of layers; see
+    """Write the gradients of the previous memory, and accumulate those of the layers; see
     :mod:`ghgs_lit.ops.round_memory`.
 
     Args:
-        each: [N, V, c], observations of each view, the own one first.
-        known: [N, k], what is known of each Gaussian beside them.
-        before: [N, h], memory of the rounds before.
-        after: [N, h], the new memory.
-        slopes: [N, h], gradients of ``after``.
+        each: observations in each view, the own view first [N, V, c].
+        known: additional inputs of each Gaussian [N, k].
+        before: memory of the previous rounds [N, h].
+        after: the new memory [N, h].
+        slopes: gradients of ``after`` [N, h].
         layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
-        backs: the same, transposed.
-        places: [layers + 1, 3], of :class:`ghgs_lit.ops.layers.Sums`.
-        sums: gradients of the layers are added, one task's.
-        d_before: [N, h], written in these rows.
+        backs: the packed transposed layers.
+        places: [layers + 1, 3]; see :class:`ghgs_lit.ops.layers.Sums`.
+        sums: accumulated, gradients of the layers in one task.
+        d_before: written in these rows [N, h].
         first: first row.
         last: end of the rows, excluded.
     """
@@ -193,18 +184,18 @@ def remember_back(
             learn(x, channels, up, hidden, turned, places[0, 2], sums)
 
 
-#: Gaussians in one task: each has its own sums.
+#: Gaussians in one task; each task has its own sums.
 _LEARNED = 2048
 
 
 def gradients(
     rows: Sequence[Tensor], weights: Sequence[Tensor], slopes: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
-    """Gradients of the memory before, and of weights and biases.
+    """Compute the gradients of the previous memory, and of weights and biases.
 
     Args:
-        rows: observations, what is known, the memory before and after.
-        weights: weights and biases of the five layers, in turn.
+        rows: observations, additional inputs, and the memory before and after.
+        weights: weights and biases of the five layers, alternating.
         slopes: gradients of the memory after.
     """
     parts = pool.even_parts(len(slopes), _LEARNED)
