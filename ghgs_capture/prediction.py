@@ -1,4 +1,6 @@
-"""Gaussians of a capture in the user's world, and of any batch, with corrected cameras and tone curves."""
+"""Predict the Gaussians of a capture, in the user's world, or of any batch of one subject.
+
+Masks, cameras and tone curves are corrected before, and Gaussians refined after the prediction."""
 
 import functools
 import math
@@ -28,9 +30,8 @@ from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.reading import SHIPPED, file_of
 
-#: Log gamma of all channels, beside the median camera's, above which a camera has a tone curve of
-#: its own, and how many times as large in one as in another: what light and wrong depths do
-#: differs between them.
+#: Log gamma of every channel, relative to the median camera, above which a camera has a different tone
+#: curve, and the largest ratio between its channels: effects of light and of wrong depths differ more.
 _OWN = 0.1
 _UNLIKE = 2.0
 
@@ -39,17 +40,17 @@ _UNLIKE = 2.0
 class CapturePrediction:
     """A prediction with the batch that the model saw."""
 
-    #: photographs or crops around the subject, masks and cameras, corrected where asked
+    #: photographs or crops around the subject, masks and cameras, with any corrections
     batch: Batch
-    prediction: Prediction  #: of this batch, in the world and unit of its cameras
-    #: pixels that correcting cameras moved the subject by in each photograph
+    prediction: Prediction  #: for this batch, in the world and unit of its cameras
+    #: pixels by which correcting the cameras moved the subject in each photograph
     moved: tuple[float, ...] = ()
     #: share of the subject that refining masks changed in each crop
     changed: tuple[float, ...] = ()
-    refined: Report | None = None  #: what refining the Gaussians gained, where asked; depths stay
-    #: doubts, by the refinement that ``auto`` chose
+    refined: Report | None = None  #: gain of refining the Gaussians, if any; depths are unchanged
+    #: reasons of ``auto``, by name of the refinement that it chose
     why: dict[str, str] = field(default_factory=dict)
-    #: gammas of cameras that were undone, by name
+    #: gammas that were undone, by camera
     tones: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -68,27 +69,27 @@ def predict(
     renderer: Renderer | None = None,
     tones: Mapping[str, float] | Literal["auto"] = "auto",
 ) -> CapturePrediction:
-    """The Gaussians of a capture, in the user's world.
+    """Predict the Gaussians of a capture, in the user's world.
 
     Args:
         capture: photographs of one instant with masks and cameras, in any unit of length.
-        model: a predictor or its stages in evaluation mode, or a checkpoint (kept in memory for further
-            calls): a path, or the one that comes with the package.
-        size: side or (height, width) of the crops that the model sees, in pixels; None: as it was
-            trained (checkpoints only).
-        refine_cameras: most rounds that correct the cameras until the photographs agree
-            (:class:`ghgs_lit.refinement.CameraRefinement`); 0: none; ``auto``: 4 where silhouettes
+        model: a predictor or its stages in evaluation mode, or a checkpoint (cached for further calls):
+            a path, or ``shipped`` for that of this package.
+        size: side or (height, width) of the model's input crops in pixels; None: the size of its
+            training (checkpoints only).
+        refine_cameras: maximum number of rounds that correct the cameras until the photographs agree
+            (:class:`ghgs_lit.refinement.CameraRefinement`); 0: none; ``auto``: 4 if silhouettes
             contradict one another.
-        refine_masks: pixels of a crop by which masks may be wrong; mattes are then searched in the
-            photographs (:func:`ghgs_lit.data.matting.refine_matte`). 0: masks are right; ``auto``:
-            4 where photographs show other outlines.
-        refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
-        renderer: what refining draws with; None: that of the device.
-        tones: gammas of cameras, by name, that are undone first; ``auto``: of those that have one
-            of their own beside the others, by a first prediction.
+        refine_masks: pixels of a crop by which outlines of masks may be wrong; mattes are then estimated
+            from the photographs (:func:`ghgs_lit.data.matting.refine_matte`). 0: masks are used
+            unchanged; ``auto``: 4 if photographs show other outlines.
+        refine: optimisation steps of the Gaussians towards the photographs, such as 15; 0: none.
+        renderer: renders the comparisons of refinements; None: the default for the device.
+        tones: gammas to undo first, by camera; ``auto``: those of cameras that differ from the others
+            in a first prediction.
 
     Returns:
-        The prediction with the crops, on the model's device, and what was corrected and why.
+        The prediction with the crops, on the model's device, and the corrections with their reasons.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
@@ -120,20 +121,7 @@ def _predicted(
     refine: int,
     renderer: Renderer,
 ) -> CapturePrediction:
-    """:func:`predict` of photographs with their colours as they are.
-
-    Args:
-        capture: photographs of one instant.
-        model: in evaluation mode.
-        size: (height, width) of the crops in pixels.
-        refine_cameras: as for :func:`predict`.
-        refine_masks: as for :func:`predict`.
-        refine: as for :func:`predict`.
-        renderer: what refining draws with.
-
-    Returns:
-        As of :func:`predict`, without ``tones``.
-    """
+    """:func:`predict` without correction of tone curves."""
     why = {}
     if refine_masks == "auto":
         why["refine_masks"] = doubt_of_masks(capture, size)
@@ -153,7 +141,7 @@ def _predicted(
 
 
 def in_frame(model: Predictor, batch: Batch) -> Prediction:
-    """Predict in the subject's frame, whatever the weights, so that a capture may have any unit.
+    """Predict in the subject's frame with any weights, so that a capture may have any unit of length.
 
     Args:
         model: in evaluation mode.
@@ -162,7 +150,7 @@ def in_frame(model: Predictor, batch: Batch) -> Prediction:
     Returns:
         The prediction in the world of the batch's cameras.
     """
-    # Weights with compat=release do not enter a frame of their own.
+    # Models with compat=release do not convert to the subject's frame themselves.
     frame = Frame.of(batch)
     return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
 
@@ -175,19 +163,19 @@ def predict_batch(
     refine: int = 0,
     forward: Callable[[Batch], Prediction] | None = None,
 ) -> CapturePrediction:
-    """The Gaussians of a batch of one subject, which keeps its targets.
+    """Predict the Gaussians of a batch of one subject, with optional refinement.
 
     Args:
-        batch: photographs, masks and cameras, on the model's device.
+        batch: photographs, masks and cameras, on the model's device; targets are kept.
         model: in evaluation mode.
-        renderer: draws what :class:`ghgs_lit.refinement.CameraRefinement` and
-            :class:`ghgs_lit.refinement.Refinement` compare.
-        refine_cameras: most rounds of ``CameraRefinement``; 0: none.
+        renderer: renders the comparisons of :class:`ghgs_lit.refinement.CameraRefinement` and
+            :class:`ghgs_lit.refinement.Refinement`.
+        refine_cameras: maximum number of rounds of ``CameraRefinement``; 0: none.
         refine: steps of ``Refinement``; 0: none.
-        forward: predicts a batch without targets; None: the model.
+        forward: predicts a batch without targets; None: ``model``.
 
     Returns:
-        The prediction, with the batch as corrected.
+        The prediction with the corrected batch.
     """
     forward = forward or model
     moved = ()
@@ -207,12 +195,14 @@ def predict_batch(
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
-    """Size of the photographs that a checkpoint's model was trained with.
+    """Size of the input images that a checkpoint's model was trained with.
+
+    For a coarse-to-fine model, it is the size at which a subject has the height of the coarse round
+    (``rounds.height``) if the training images were larger; larger sizes must be requested. For imported
+    weights without a data set, it is the size of the encoder's position embedding.
 
     Args:
-        config: of the checkpoint. A training from coarse to fine saw larger photographs than those
-            in which its stages know a subject (``rounds.height``): the latter count, for larger
-            ones are asked for. Of imported weights the encoder's position embedding counts.
+        config: configuration of the checkpoint.
 
     Returns:
         Side or (height, width) in pixels.
@@ -229,21 +219,21 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
 def crop_size(
     size: int | tuple[int, int] | None, config: Mapping[str, Any], model: Predictor
 ) -> tuple[int, int]:
-    """Size of the crops that a checkpoint's model sees.
+    """Size of the input crops for a checkpoint's model.
 
-    Warns of sizes larger than in training, which make results worse, not sharper, where the model
-    does not work from coarse to fine (``rounds.height``).
+    Warns of sizes larger than in training, which make results worse, not sharper, unless the model
+    works from coarse to fine (``rounds.height``).
 
     Args:
-        size: side or (height, width) in pixels; None: as the model was trained.
-        config: of the checkpoint.
-        model: that of the checkpoint.
+        size: side or (height, width) in pixels; None: the size of the training.
+        config: configuration of the checkpoint.
+        model: model of the checkpoint.
 
     Returns:
         (height, width) in pixels.
 
     Raises:
-        InputError: the model cannot take this size.
+        InputError: a side is not divisible by the model's patch size.
     """
     trained = image_size("size", trained_size(config))
     height, width = trained if size is None else image_size("size", size)
@@ -266,16 +256,16 @@ def _model(path: Path, changed: int) -> Predictor:
 
 
 def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
-    """Find cameras with a tone curve of their own.
+    """Find cameras with a different tone curve from the others.
 
-    Two photographs do not tell which of them has it.
+    Needs three cameras: with two it is undecidable which one differs.
 
     Args:
         batch: photographs of one subject.
         gaussians: predicted from the batch.
 
     Returns:
-        Their gammas, about, by name.
+        The approximate gammas of these cameras, by name.
     """
     if len(batch.views[0]) < 3:
         return {}
@@ -288,14 +278,11 @@ def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
 
 
 def without_tones(capture: Capture, tones: Mapping[str, float]) -> Capture:
-    """Undo tone curves.
+    """Undo tone curves of photographs.
 
     Args:
-        capture: photographs as they are.
-        tones: gammas above 0 by camera.
-
-    Returns:
-        The capture with these gammas undone; photographs of other cameras stay.
+        capture: photographs with their tone curves.
+        tones: gammas above 0 by camera; photographs of other cameras are unchanged.
     """
     if not tones:
         return capture

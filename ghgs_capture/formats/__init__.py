@@ -1,4 +1,4 @@
-"""Files of cameras: each format a function from a path to a :class:`CameraFile`."""
+"""Read files of cameras; each format is a function from a path to a :class:`CameraFile`."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +12,7 @@ from ghgs_lit.parsing import find_path
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 
-#: Readers by the format's name; ``ghgs`` is this package's JSON.
+#: Readers by format; ``ghgs`` is this package's JSON.
 FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "ghgs": read_matrices,
     "colmap": read_colmap,
@@ -22,22 +22,22 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "toml": read_matrices,
     "qualisys": read_matrices,
 }
-_SINGLE = (".json", ".toml", QUALISYS)  # Endings of formats of one file
+_SINGLE = (".json", ".toml", QUALISYS)  # Suffixes of formats with a single file
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
-    """Read a file or a folder of cameras; a warning names entries that are not read.
+    """Read a file or a folder of cameras; a warning lists entries that are not read.
 
     Args:
-        path: a file, or the folder of one: of transforms.json, COLMAP's model, EasyMocap's files,
-            OpenCV's YAML of each camera, or a single JSON, TOML or .qca.txt.
-        format: one of :data:`FORMATS`; ``auto`` tells it by file names and keys of JSON.
+        path: a file, or a folder that contains transforms.json, a COLMAP model, EasyMocap's files,
+            OpenCV's YAML files, one per camera, or a single JSON, TOML or .qca.txt.
+        format: one of :data:`FORMATS`; ``auto``: detected from file names and keys of JSON.
 
     Returns:
-        The cameras, and the meaning of their numbers by the format.
+        The cameras, and the format's convention for their numbers.
 
     Raises:
-        InputError: no such path or format, or a wrong camera.
+        InputError: the path or format does not exist, or a camera is invalid.
     """
     path = Path(path).expanduser()
     require_choice("calibration.format", format, ("auto", *FORMATS))
@@ -56,9 +56,8 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
 
 
 def _candidates(path: Path) -> Iterator[tuple[str, Path]]:
-    """Formats that a path may have, and the file or folder of each, the preferred first.
-
-    InputError: a folder holds several files of cameras."""
+    """Possible formats of a path, each with its file or folder, the preferred first; raises InputError if
+    a folder contains several files of cameras."""
     name = path.name.lower()
     if path.is_dir():
         if find_path(path, EASYMOCAP[0]) is not None:

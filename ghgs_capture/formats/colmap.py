@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, text and binary, by COLMAP's own reader (the extra ``colmap``)."""
+"""Read COLMAP's sparse models, text and binary, with pycolmap (the extra ``colmap``)."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from ghgs_capture.formats.matrices import read_camera
 from ghgs_lit.errors import InputError, import_optional, require
 from ghgs_lit.parsing import require_file
 
-#: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
+#: Parameters of each of COLMAP's camera models, in order; ``f`` is both focal lengths.
 _MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
@@ -27,30 +27,30 @@ def find_model(path: Path) -> Path | None:
     """Find a sparse model.
 
     Args:
-        path: the model's folder, or one above it as COLMAP lays them out.
+        path: the model's folder, or a folder above it in COLMAP's layout.
 
     Returns:
-        The folder of the model; None where there is none.
+        The folder of the model, or None.
     """
     folders = [path, path / "sparse" / "0", path / "sparse", path / "0"]
     return next((p for p in folders if (p / "cameras.bin").exists() or (p / "cameras.txt").exists()), None)
 
 
 def read_colmap(path: Path) -> CameraFile:
-    """Registered photographs of a sparse model, text or binary.
+    """Read the cameras of a sparse model's registered photographs, from text or binary files.
 
-    Formats: https://colmap.github.io/format.html and, of camera models,
+    File formats: https://colmap.github.io/format.html; camera models:
     https://colmap.github.io/cameras.html.
 
     Args:
         path: folder of the model or above it, or one of its files.
 
     Returns:
-        Cameras named by their photographs.
+        Cameras named after their photographs.
 
     Raises:
         InputError: the model cannot be read, pycolmap is not installed, or a camera model is not
-            known.
+            supported.
     """
     folder = find_model(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
@@ -73,32 +73,20 @@ def read_colmap(path: Path) -> CameraFile:
 
 
 def _read_names(folder: Path) -> dict[int, str]:
-    """Names of photographs in ``images.txt`` by id; COLMAP's own reader cuts them at a space."""
+    """Names of photographs in ``images.txt`` by id, since pycolmap truncates them at a space."""
     path = folder / "images.txt"
     if (folder / "images.bin").exists() or not path.exists():
         return {}
     lines = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     lines = [line for line in lines if not line.startswith("#")]
-    # Every second line has points.
+    # Every second line contains points.
     images = [fields for line in lines[::2] if len(fields := line.split(maxsplit=9)) == 10]
     return {int(fields[0]): fields[9].rstrip() for fields in images if fields[0].isdecimal()}
 
 
 def _make_camera(folder: Path, name: str, image, camera) -> StoredCamera:
-    """One registered photograph's camera.
-
-    Args:
-        folder: of the model, for messages.
-        name: of the photograph.
-        image: pycolmap's image, with a pose.
-        camera: pycolmap's camera of this image.
-
-    Returns:
-        The camera, world to camera with OpenCV axes.
-
-    Raises:
-        InputError: its model is not among ``_MODELS``.
-    """
+    """Convert pycolmap's image (with a pose) and its camera; raises InputError for other camera models
+    than ``_MODELS``."""
     origin = f"{folder}: {name}"
     model = camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)

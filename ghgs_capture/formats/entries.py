@@ -1,5 +1,4 @@
-"""Cameras of a file, and the entries of each: read under any usual spelling, of the right type,
-or named."""
+"""Cameras of a file, and their entries, which are read under any usual spelling and checked for type."""
 
 import math
 import re
@@ -17,7 +16,7 @@ from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import normalize_name, split_path
 
-#: What files call the same thing, as :func:`plain` spells it.
+#: Synonyms of each entry in files, as normalised by :func:`plain`
 NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
     "extrinsics": ("extrinsics",),
@@ -31,11 +30,10 @@ NAMES = {
     "model": ("cameramodel", "distortionmodel", "lensmodel", "projection", "projectionmodel"),
     "gains": ("gains",),
 }
-#: Coefficients with an entry each: of OpenCV's model, and of a fisheye's.
+#: Names of distortion coefficients: of OpenCV's perspective and fisheye models
 PERSPECTIVE = "k1 k2 p1 p2 k3 k4 k5 k6"
 FISHEYE = "k1 k2 k3 k4"
-# Camera models that are read: those of a pinhole, with OpenCV's distortion,
-# and of OpenCV's fisheye.
+# Supported camera models: pinhole, with OpenCV's distortion, and OpenCV's fisheye
 _PINHOLES = ("pinhole", "perspective", "simplepinhole", "none")
 _BROWN = (
     *("opencv", "radial", "simpleradial", "fullopencv", "brown", "brownconrady", "radtan", "standard"),
@@ -45,11 +43,11 @@ _FISHEYES = (
     *("opencvfisheye", "simpleradialfisheye", "radialfisheye", "fisheye", "equidistant"),
     *("kannalabrandt", "kannalabrandt4", "kb4"),
 )
-# Entries about a lens, as :func:`plain` spells them, and models that such entries may name.
+# Patterns of keys that concern a lens, as normalised by :func:`plain`, and of names of lens models
 _KINDS = "fisheye|omni|spheric|equirect|latlong|theta|panoram|orthogr|cylind|catadiop|stereograph"
 _LENS = re.compile(f"(?<!un)dist(?!ance)|lens|radial|tangent|model|^k$|^[kps][0-9]$|^xi$|{_KINDS}")
 _MODELS = re.compile(f"equidist|kannala|division|prism|fov|ucm|doublesphere|vr180|360|{_KINDS}")
-#: Entries of a camera, or beside cameras, that do not matter, as :func:`plain` spells them.
+#: Irrelevant entries of a camera or of its file, as normalised by :func:`plain`
 IRRELEVANT = (
     *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
     *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras"),
@@ -58,19 +56,13 @@ IRRELEVANT = (
 
 
 def plain(key: str) -> str:
-    """A key without case, signs and a final "coefficients" or "parameters", by which files differ.
-
-    Args:
-        key: as the file has it.
-
-    Returns:
-        Lower-case letters and digits alone.
-    """
+    """Normalise a key of a file to lower-case letters and digits, without a final "coefficients" or
+    "parameters"."""
     return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, str(key).lower())))
 
 
 def _read_number(place: str, value: Any) -> float:
-    """An entry as a number; text that spells a number is one."""
+    """Convert an entry to a number, also from text."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -91,14 +83,14 @@ def _read_text(place: str, value: Any) -> str:
 
 
 class Entries:
-    """The entries of a camera. A null counts as missing. Methods give None where an entry is
-    missing, and refuse (InputError) one of a wrong type, and two that mean the same and differ.
+    """The entries of a camera; null counts as missing.
 
-    ``what`` is one of :data:`NAMES`, or another key.
+    Methods return None for a missing entry, and raise InputError for an entry of a wrong type and for
+    synonymous entries with different values. ``what`` is a key of :data:`NAMES`, or another key.
 
     Attributes:
         origin: file and camera, for messages.
-        fields: values by key as the file has them."""
+        fields: values by key, as in the file."""
 
     def __init__(self, origin: str, fields: Mapping[str, Any]) -> None:
         self.origin = origin
@@ -106,32 +98,32 @@ class Entries:
         self._read: set[str] = set()
 
     def keys(self, what: str) -> list[str]:
-        """The keys of the file that spell ``what``, the preferred first."""
+        """Keys of the file that are synonyms of ``what``, the preferred first."""
         names = NAMES.get(what, (plain(what),))
         spelled = [key for key in self.fields if plain(key) in names]
         return sorted(spelled, key=lambda key: names.index(plain(key)))
 
     def number(self, what: str) -> float | None:
-        """A finite number."""
+        """Read a finite number."""
         return self._value(what, _read_number)
 
     def flag(self, what: str) -> bool | None:
-        """True or false, also as 1 or 0; anything else, such as the text "no", is refused."""
+        """Read true or false, also as 1 or 0; anything else, such as the text "no", raises InputError."""
         return self._value(what, _read_flag)
 
     def text(self, what: str) -> str | None:
-        """Text; None also where it is empty."""
+        """Read text; None also if it is empty."""
         return self._value(what, _read_text) or None
 
     def has(self, what: str, *shapes: tuple[int | None, ...]) -> bool:
-        """Whether there is an array of one of several shapes; None is any length of an axis."""
+        """Whether there is an array of one of several shapes; None in a shape allows any length."""
         return any(_fits(self.fields[key], shapes) for key in self.keys(what))
 
     def array(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """An array of one of several shapes, as of :meth:`has`.
+        """Read an array of one of several shapes, as for :meth:`has`.
 
-        Of several entries those count that have such a shape: ``K`` is a matrix beside ``k``,
-        coefficients of a lens."""
+        Among synonymous entries only those with such a shape are read: a file may contain a matrix ``K``
+        and lens coefficients ``k``."""
 
         def numbers(place: str, value: Any) -> np.ndarray:
             require(not _has_flags(value), place, "numbers", value)
@@ -143,14 +135,14 @@ class Entries:
         )
 
     def needed(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
-        """As :meth:`array`, of an entry that must be there."""
+        """Read an array as :meth:`array`; raises InputError if it is missing."""
         value = self.array(what, *shapes)
         names = NAMES.get(what, (what,))
         require(value is not None, self.origin, f"{what} ({' or '.join(names)})", sorted(self.fields))
         return value
 
     def _value(self, what: str, convert: Callable[[str, Any], Any], keys: Sequence[str] | None = None) -> Any:
-        """The one value of all entries that spell ``what``, or of some ``keys`` of these."""
+        """Common value of all synonyms of ``what``, or only of ``keys``, which count as read."""
         keys = self.keys(what) if keys is None else keys
         self._read |= set(keys)
         values = [convert(f"{self.origin}: {key}", self.fields[key]) for key in keys]
@@ -160,7 +152,7 @@ class Entries:
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """(height, width) in pixels, given as two numbers or as a list (width, height)."""
+        """(height, width) in pixels, from two numbers or a list (width, height) in the file."""
         both = self.array("size", (2,), (2, 1), (1, 2))
         sides = []
         for name, listed in zip(
@@ -176,7 +168,7 @@ class Entries:
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether flag or model say so; they must not differ."""
+        """Whether the lens is a fisheye, from a flag or the camera model, which must agree."""
         flag = self.flag("fisheye")
         models = {key: str(self.fields[key]) for key in self.keys("model")}
         self._read |= models.keys()
@@ -194,17 +186,16 @@ class Entries:
         return is_fisheye if flag is None else flag
 
     def distortion(self, order: str) -> np.ndarray:
-        """Distortion coefficients, as a list or with an entry each.
+        """Read distortion coefficients from a list or from one entry each.
 
         Args:
-            order: names of the entries that are allowed, in their order, with spaces between them.
+            order: names of the allowed entries in their order, separated by spaces.
 
         Returns:
-            The coefficients, of a list as it is; those with an entry each in this order, none if
-            all are 0.
+            The list as in the file, or the entries in this order; empty if all entries are 0.
 
         Raises:
-            InputError: there is another coefficient that is not 0, or list and entries differ.
+            InputError: another coefficient is not 0, or list and entries differ.
         """
         listed = self.array("distortion", (None,), (None, 1), (1, None))
         numbers = {name: self.number(name) for name in PERSPECTIVE.split()}
@@ -221,14 +212,14 @@ class Entries:
         return listed
 
     def unread(self, irrelevant: Sequence[str] = IRRELEVANT) -> tuple[str, ...]:
-        """Keys of entries that nothing has read so far.
+        """Keys of entries that have not been read.
 
         Args:
-            irrelevant: keys that do not matter, spelled as :func:`plain` does.
+            irrelevant: keys to leave out, as normalised by :func:`plain`.
 
         Raises:
-            InputError: one about the lens is neither empty nor 0: without it the picture would be
-                bent.
+            InputError: an unread entry concerns the lens and is neither empty nor 0; ignoring it would
+                leave the image distorted.
         """
         left = [key for key in self.fields if key not in self._read and plain(key) not in irrelevant]
         lens = [key for key in left if _bends(plain(key), self.fields[key])]
@@ -241,9 +232,8 @@ class Entries:
 
 
 def _bends(key: str, value: Any) -> bool:
-    """Whether an entry says something of the lens: numbers other than 0, or a model of another
-    kind, which may be the value of any key, such as ``type``. ``key``: spelled as
-    :func:`plain` does."""
+    """Whether an entry (key normalised by :func:`plain`) describes a lens: numbers other than 0, or an
+    unsupported model, which may be the value of any key, such as ``type``."""
     if isinstance(value, str):
         model = plain(value)
         is_model = bool(_MODELS.match(model)) and len(value.split()) == 1
@@ -252,7 +242,7 @@ def _bends(key: str, value: Any) -> bool:
 
 
 def _fits(value: Any, shapes: tuple[tuple[int | None, ...], ...]) -> bool:
-    """Whether nested lists are numbers of one of several shapes; None is any length."""
+    """Whether nested lists are numbers of one of several shapes."""
     try:
         check_array("", value, shapes)
     except InputError:
@@ -261,28 +251,18 @@ def _fits(value: Any, shapes: tuple[tuple[int | None, ...], ...]) -> bool:
 
 
 def _has_flags(value: Any) -> bool:
-    """Whether true or false is among the numbers of nested lists."""
+    """Whether nested lists contain true or false."""
     return any(map(_has_flags, value)) if isinstance(value, list | tuple) else isinstance(value, bool)
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """Intrinsics of a pinhole camera.
-
-    Args:
-        fx: horizontal focal length in pixels.
-        fy: vertical focal length in pixels.
-        cx: column of the principal point, in pixels.
-        cy: row of the principal point, in pixels.
-
-    Returns:
-        The matrix [3, 3] float64.
-    """
+    """Intrinsics [3, 3] float64 of a pinhole camera, from focal lengths and principal point in pixels."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The cameras of a file by name, and the meaning of their numbers by its format."""
+    """The cameras of a file by name, and its format's convention for their numbers."""
 
     cameras: dict[str, StoredCamera]
     convention: Convention
@@ -291,22 +271,19 @@ class CameraFile:
     def of(
         cls, cameras: Sequence[StoredCamera], convention: Convention, unread: Sequence[str] = ()
     ) -> "CameraFile":
-        """Name cameras by their photographs, without folder and suffix, in their order.
+        """Name cameras after their photographs, without folder and suffix, in their order.
 
-        Where different cameras share such a name (that of an instant), all are named by their
-        folders, or as the file has it. A camera that is listed for several photographs is one,
-        without their masks. One warning names all entries that are not read.
+        If different cameras would share a name (that of an instant), all are named after their folders,
+        or else as in the file. A camera that is listed for several photographs is kept once, without
+        their masks. One warning lists all entries that are not read.
 
         Args:
-            cameras: with names as the file has them.
-            convention: meaning of their numbers by the format.
-            unread: keys beside the cameras that are not read.
-
-        Returns:
-            The cameras by name.
+            cameras: with names as in the file.
+            convention: the format's convention for their numbers.
+            unread: unread keys of the file outside of the cameras.
 
         Raises:
-            InputError: two different cameras have one name.
+            InputError: two different cameras have the same name.
         """
         if unread := sorted(set(unread).union(*(camera.unread for camera in cameras))):
             warnings.warn(f"cameras: entries that are not read: {', '.join(unread)}", stacklevel=3)

@@ -1,9 +1,9 @@
-"""Cameras with named matrices: this package's JSON, and OpenCV's as YAML, JSON, TOML or XML.
+"""Read cameras stored as named matrices: this package's JSON, and OpenCV's as YAML, JSON, TOML or XML.
 
-YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair; TOML is
-of Pose2Sim, Anipose and Caliscope; XML is Qualisys' ``.qca.txt``. Files differ in spelling:
-``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. OpenCV's poses
-map the world to the camera; pixel centres are at integers."""
+YAML of ``cv2.FileStorage`` has a file for each camera, one file for all, or EasyMocap's two files. TOML is
+written by Pose2Sim, Anipose and Caliscope; XML is Qualisys' ``.qca.txt``. Files differ in spelling:
+``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. OpenCV's poses map
+the world to the camera; pixel centres are at integers."""
 
 import json
 import re
@@ -24,13 +24,13 @@ from ghgs_lit.parsing import check_yaml, find_path, read_parsed
 EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
 QUALISYS = ".qca.txt"
 _VECTORS = (3,), (3, 1), (1, 3)
-_SUBPIXELS = 64  # of Qualisys in a pixel
+_SUBPIXELS = 64  # Qualisys stores 64ths of pixels
 _LENS = {"k1": "radialDistortion1", "k2": "radialDistortion2", "p1": "tangentalDistortion1"}
 _LENS |= {"p2": "tangentalDistortion2", "k3": "radialDistortion3"}
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with OpenCV's tag for matrices, and keys that stay text: 01 is the name of a camera."""
+    """YAML loader with OpenCV's tag for matrices; keys remain text, since 01 is the name of a camera."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         for key, _ in node.value:
@@ -40,8 +40,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _construct_matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
-    """The node ``{rows, cols, dt, data}``, or ``{sizes, dt, data}`` as OpenCV 5 writes arrays
-    of one axis."""
+    """Construct an array from ``{rows, cols, dt, data}``, or from ``{sizes, dt, data}``, as which OpenCV 5
+    writes arrays with one axis."""
     fields = loader.construct_mapping(node, deep=True)
     sizes = fields["sizes"] if "sizes" in fields else (fields["rows"], fields["cols"])
     return np.array(fields["data"], np.float64).reshape(tuple(map(int, sizes)))
@@ -52,7 +52,7 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def _parse_yaml(text: str) -> Any:
-    text = re.sub(r"\A%YAML[^\n]*\n", "", text)  # OpenCV's "%YAML:1.0" is no directive of YAML
+    text = re.sub(r"\A%YAML[^\n]*\n", "", text)  # OpenCV's "%YAML:1.0" is not a valid directive
     check_yaml(text)
     return yaml.load(text, _Loader)
 
@@ -70,8 +70,7 @@ def _parse_json(text: str) -> Any:
 
 
 def _parse_qualisys(text: str) -> dict[str, Any]:
-    """Cameras of Qualisys by serial number, with OpenCV's names: its pose maps the camera to
-    the world."""
+    """Parse Qualisys' XML (camera-to-world poses) to cameras by serial number, with OpenCV's keys."""
     cameras = {}
     try:
         for camera in ElementTree.fromstring(text).iter("camera"):
@@ -99,7 +98,7 @@ def _parse_qualisys(text: str) -> dict[str, Any]:
     return cameras
 
 
-#: By ending: the parser, what the file should be, and the meaning of its numbers.
+#: By suffix: the parser, a description for messages, and the convention of the numbers
 _KINDS = {
     ".json": (_parse_json, "JSON", Convention(pixel_centers="integer")),
     ".toml": (tomllib.loads, "TOML", Convention(pixel_centers="integer")),
@@ -113,16 +112,13 @@ _KINDS = {
 
 
 def read_mapping(path: Path) -> tuple[dict[str, Any], Convention]:
-    """The mapping in a file of JSON, TOML, Qualisys' XML or else YAML.
-
-    Args:
-        path: of the file.
+    """Parse a file of JSON, TOML, Qualisys' XML or else YAML.
 
     Returns:
-        The mapping, and what OpenCV's matrices in it mean.
+        The mapping in the file, and the convention of OpenCV's matrices in it.
 
     Raises:
-        InputError: the file cannot be read or parsed, holds no mapping, or JSON with a key twice.
+        InputError: the file cannot be read or parsed, is not a mapping, or is JSON with a duplicate key.
     """
     kind = next(ending for ending in _KINDS if path.name.lower().endswith(ending))
     parse, expected, convention = _KINDS[kind]
@@ -132,30 +128,26 @@ def read_mapping(path: Path) -> tuple[dict[str, Any], Convention]:
 
 
 def list_yaml(folder: Path) -> list[Path]:
-    """The YAML files of a folder, sorted by name.
-
-    Args:
-        folder: where they lie.
-    """
+    """YAML files of a folder, sorted by name."""
     return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".yml", ".yaml")]
 
 
 def read_matrices(path: Path) -> CameraFile:
-    """Cameras of a file, of all YAML files of a folder, or of EasyMocap's pair.
+    """Read cameras from a file, from all YAML files of a folder, or from EasyMocap's two files.
 
-    This package's JSON is ``{"cameras": {<name>: {...}}}``, or that mapping alone, with ``intrinsics``
+    This package's JSON is ``{"cameras": {<name>: {...}}}``, or only the inner mapping, with ``intrinsics``
     [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``, ``fisheye`` and
-    ``gains`` in the conventions of :mod:`ghgs_lit.types`; only the first two must be there. Other
-    cameras have ``K``, ``R``, ``T``, ``D``: OpenCV's.
+    ``gains`` in the conventions of :mod:`ghgs_lit.types`; only the first two are required. Other cameras
+    have OpenCV's ``K``, ``R``, ``T``, ``D``.
 
     Args:
-        path: of the file or folder.
+        path: the file or folder.
 
     Returns:
-        The cameras, named by their files or entries.
+        The cameras, named after their files or entries.
 
     Raises:
-        InputError: a camera or file is missing or wrong.
+        InputError: a camera or file is missing or invalid.
     """
     cameras: list[StoredCamera] = []
     unread: list[str] = []
@@ -178,7 +170,7 @@ def read_matrices(path: Path) -> CameraFile:
 
 
 def _read_contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Convention]]:
-    """Files with the mappings in them; EasyMocap's two are one."""
+    """Yield each file with its mapping and convention; EasyMocap's two files are merged."""
     folder = path if path.is_dir() else path.parent
     is_pair = find_path(folder, EASYMOCAP[0]) is not None if path.is_dir() else path.name.lower() in EASYMOCAP
     if not is_pair:
@@ -195,8 +187,8 @@ def _read_contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Conventio
 
 
 def _list_cameras(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What may be cameras by name: the file itself, those of the entry ``cameras`` (a mapping or a
-    list), or all entries; tables of TOML are named by their key ``name``."""
+    """Possible cameras by name: the file itself, those of the entry ``cameras`` (a mapping or a list), or
+    all entries; tables of TOML are named by their key ``name``."""
     if _has_intrinsics(content):
         return {path.stem: content}
     cameras = content.get("cameras", content)
@@ -214,15 +206,15 @@ def _list_cameras(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _split_by_suffix(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01;
-    and the other entries."""
+    """Group entries by the camera in their suffix (K_01, dist_01, R_01 vector, Rot_01 matrix, T_01), and
+    return them with the remaining entries."""
     cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
     others: dict[str, Any] = {}
     for key, value in fields.items():
-        # The longest name: K_1 beside K_cam_1.
+        # The longest matching name: a file may contain both K_1 and K_cam_1.
         name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
         field = key.removesuffix(f"_{name}")
-        # EasyVolcap's t is a time
+        # In EasyVolcap, t is a time.
         cameras.get(name, others)["time" if field == "t" else field] = value
     return cameras, others
 
@@ -232,14 +224,14 @@ def _has_intrinsics(fields: Any) -> bool:
 
 
 def read_camera(name: str, entries: Entries) -> StoredCamera:
-    """One camera with matrices under any usual names; a rotation is a matrix or a vector.
+    """Read a camera with matrices under any usual names; its rotation is a matrix or a rotation vector.
 
     Args:
-        name: of the camera.
-        entries: of the camera; a pose maps the world to it.
+        name: name of the camera.
+        entries: its entries, with a pose as extrinsics or as rotation and translation.
 
     Raises:
-        InputError: an entry is missing or wrong.
+        InputError: an entry is missing or invalid.
     """
     pose = np.eye(4)
     if entries.keys("extrinsics"):
@@ -264,44 +256,37 @@ def read_camera(name: str, entries: Entries) -> StoredCamera:
 
 
 def _read_rotation(entries: Entries) -> np.ndarray:
-    """A matrix is preferred to a vector, which then counts as read."""
+    """Read the rotation [3, 3], preferably from a matrix; a vector in addition also counts as read."""
     vector = entries.array("rotation", *_VECTORS) if entries.has("rotation", *_VECTORS) else None
     if vector is None or entries.has("rotation", (3, 3)):
         return entries.needed("rotation", (3, 3))
-    from scipy.spatial.transform import Rotation  # here: a twentieth of a second for rare files
+    from scipy.spatial.transform import Rotation  # here: the import takes 50 ms, for rare files
 
     return Rotation.from_rotvec(vector.ravel()).as_matrix()
 
 
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
-    """A camera of this package's JSON.
+    """Convert a camera to plain data for this package's JSON.
 
     Args:
         intrinsics: array or tensor [3, 3] in pixels.
         extrinsics: array or tensor [4, 4], world to camera.
         size: (height, width) of its photograph in pixels.
-
-    Returns:
-        Plain data.
     """
     matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
     return {**matrices, "width": size[1], "height": size[0]}
 
 
 def cameras_json(entries: Mapping[str, dict[str, Any]]) -> str:
-    """The text of this package's JSON of cameras.
-
-    Args:
-        entries: those of :func:`camera_entry`, by name.
-    """
+    """Serialise entries of :func:`camera_entry`, by name, as this package's JSON."""
     return json.dumps({"cameras": entries}, indent=1)
 
 
 def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
-    """Cameras as text that :func:`read_matrices` reads.
+    """Serialise cameras as JSON that :func:`read_matrices` reads.
 
     Args:
-        cameras: each with the (height, width) of its photographs in pixels.
+        cameras: by name, each with the (height, width) of its photographs in pixels.
 
     Returns:
         The content of a file.

@@ -1,5 +1,4 @@
-"""``transforms.json`` of nerfstudio and Instant NGP:
-camera-to-world matrices with OpenGL's axes."""
+"""Read ``transforms.json`` of nerfstudio and Instant NGP: camera-to-world matrices, OpenGL axes."""
 
 import math
 from collections.abc import Mapping
@@ -14,7 +13,7 @@ from ghgs_capture.formats.matrices import read_mapping
 from ghgs_lit.errors import require
 from ghgs_lit.parsing import find_path
 
-# Entries that are irrelevant for a camera, as :func:`plain` spells them.
+# Entries that are irrelevant for a camera, as normalised by :func:`plain`
 _IRRELEVANT = (
     *("frames", "aabbscale", "scale", "offset", "appliedtransform", "appliedscale", "orientationoverride"),
     *("plyfilepath", "depthfilepath", "colmapimid", "sharpness", "rotation", "time", "up"),
@@ -23,18 +22,15 @@ _IRRELEVANT = (
 
 
 def read_nerfstudio(path: Path) -> CameraFile:
-    """Cameras of ``frames``, whose intrinsics win over those of the file.
+    """Read the cameras of ``frames``; intrinsics of a frame override those of the file.
 
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.
 
-    Args:
-        path: of the file.
-
     Returns:
-        Cameras named by their photographs.
+        Cameras named after their photographs.
 
     Raises:
-        InputError: a frame is missing or wrong.
+        InputError: there are no frames, or a frame is invalid.
     """
     content, _ = read_mapping(path)
     frames = content.get("frames")
@@ -45,20 +41,8 @@ def read_nerfstudio(path: Path) -> CameraFile:
 
 
 def _read_camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
-    """The camera of one frame.
-
-    Args:
-        path: of the file; masks are sought beside it.
-        origin: file and frame, for messages.
-        shared: entries of the file, which hold for all frames.
-        frame: entries of the frame.
-
-    Returns:
-        The camera, named by its photograph, with a pose as the file has it.
-
-    Raises:
-        InputError: an entry is missing or wrong.
-    """
+    """Read the camera of one frame from its entries and those ``shared`` by all frames; masks are
+    searched relative to the file's folder."""
     require(isinstance(frame, Mapping), origin, "a mapping", frame)
     entries = Entries(origin, {**shared, **frame})
     photograph = entries.text("file_path")
@@ -84,12 +68,8 @@ def _read_camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any)
 
 
 def _read_lens(entries: Entries) -> PartialIntrinsics:
-    """What the entries say of intrinsics.
-
-    Raises:
-        InputError: there is neither a focal length nor an angle of view, or an angle is out of
-            range.
-    """
+    """Read the intrinsics; raises InputError without a focal length or angle of view, or for an angle
+    outside of 0 to pi."""
     focal = entries.number("fl_x"), entries.number("fl_y")
     middle = entries.number("cx"), entries.number("cy")
     angles = entries.number("camera_angle_x"), entries.number("camera_angle_y")
