@@ -1,4 +1,4 @@
-"""This machine: what times are measured on, and optional extras that are missing."""
+"""Description of this machine, and the optional extras of the package that are not installed."""
 
 import importlib.metadata
 import os
@@ -21,7 +21,7 @@ Line = tuple[str, str]
 
 
 def processor_name() -> str:
-    """Model name of the processor; on other systems than Linux as Python reports it."""
+    """Model name of the processor, on Linux; elsewhere the name that Python reports."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -29,10 +29,10 @@ def processor_name() -> str:
 
 
 def machine_facts(device: torch.device) -> dict[str, Any]:
-    """Processor, vector width, cores, threads, device and PyTorch's version, as plain data.
+    """Processor, vector width, cores, threads, device and version of PyTorch, as plain data.
 
     Args:
-        device: on which models run.
+        device: that models run on.
     """
     return {
         "processor": processor_name(),
@@ -46,11 +46,7 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
 
 
 def in_words(machine: dict[str, Any]) -> str:
-    """:func:`machine_facts` on one line.
-
-    Args:
-        machine: these facts.
-    """
+    """:func:`machine_facts` on one line."""
     device = "" if machine["device"] == "cpu" else f"{machine['device']}, "
     cores = f"{machine['threads']} of {machine['cores']} cores"
     return f"{device}{machine['processor']} ({machine['vectors']}, {cores}), torch {machine['torch']}"
@@ -60,7 +56,7 @@ def machine_lines(device: torch.device) -> list[Line]:
     """Facts about the machine, as pairs of name and value.
 
     Args:
-        device: on which models run.
+        device: that models run on.
     """
     facts = machine_facts(device)
     versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
@@ -77,7 +73,7 @@ def machine_lines(device: torch.device) -> list[Line]:
 
 
 def missing_extras() -> Iterator[Line]:
-    """Yield each incomplete extra of the package with the command that installs it."""
+    """Yield each extra of the package that is not fully installed, with the command that installs it."""
     wanted: dict[str, list[str]] = {}
     if version_of(DISTRIBUTION) is None:  # run from its sources
         yield DISTRIBUTION, "not installed, so that its extras are not known: pip install -e ."

@@ -251,5 +251,5 @@ def _plant(stage: Stage, value: float, cases: Values, dtype: str) -> Errors:
         first, other = torch.stack([x.reshape(2, -1).isfinite().all(1) for x in results.values()]).all(0)
         if not other or (first and not stage.silent):
             errors[i] = math.inf
-            places[i] = f"{'vanished' if other else 'reached another case'} {places[i]}"
+            places[i] += ": has no effect" if other else ": reaches another case"
     return errors, places

@@ -1,4 +1,4 @@
-"""``benchmarks/captures.py``: what its photographs show."""
+"""The photographs of ``benchmarks/captures.py``."""
 
 import dataclasses
 import runpy
@@ -28,7 +28,7 @@ def person():
 
 
 def test_each_trouble_comes_alone(script, person):
-    """Beside it everything is as in the exact capture; all at once has every one."""
+    """Each capture differs from the exact one by its trouble only; the last one has all of them."""
     exact = script["photographed"](script["CAPTURES"]["clean"], person).photographs
     for v, photograph in enumerate(exact):
         assert np.abs(photograph.matte / 255 - person.alpha[0, v].numpy()).max() < 1 / 255

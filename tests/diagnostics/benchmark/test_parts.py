@@ -65,7 +65,7 @@ def case(model, name, renderer):
 
 
 def test_cases_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, monkeypatch):
-    """Every round runs all cases once and begins with another; the warm-up does not count."""
+    """Every round runs all cases once and begins with another one."""
     seen, a, b = [], Renderer(), Renderer()
 
     def noted(model, renderer, batch, probe=None):
@@ -104,7 +104,7 @@ def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene, 
 
 ONE = torch.ones(2)
 MANY = torch.ones(300)
-MANY[:3] = torch.tensor([9.0, 3.0, 5.0])  # decisions within rounding; a defect changes more values
+MANY[:3] = torch.tensor([9.0, 3.0, 5.0])  # as of decisions within rounding; a defect changes more values
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ MANY[:3] = torch.tensor([9.0, 3.0, 5.0])  # decisions within rounding; a defect 
     ],
 )
 def test_relative_differences_are_always_defined(found, expected, share, difference):
-    """An empty or broken result must not pass a budget as nan; budgets look at most values."""
+    """An empty or broken result must not pass a budget as NaN. Budgets ignore one value of a hundred."""
     assert relative_difference(found, expected, share) == difference
 
 
@@ -146,7 +146,7 @@ KEPT = {
     ],
 )
 def test_budgets(change, broken):
-    """A preset that promises equal results also keeps the loss that its difference may cost."""
+    """A preset with ``max_rel_diff`` must also keep ``difference_db`` within its budget."""
     lines = broken_budgets({**KEPT, **change})
     assert len(lines) == len(broken)
     assert all(line.startswith(f"expected {text}") for line, text in zip(lines, broken, strict=True))
@@ -197,15 +197,15 @@ def test_gaussians_are_compared_by_their_pixel(scene, result):
     ],
 )
 def test_flops_of_products_and_attention(run, flops):
-    """PyTorch counts no attention of a CPU itself, and none of the compiled kernel."""
+    """PyTorch counts neither attention on a CPU nor the compiled kernel."""
     with torch.no_grad(), flop_counter() as counter:
         run()
     assert counter.get_total_flops() == flops
 
 
 @pytest.mark.parametrize("share", [0.05, 0.15, 0.6])
-def test_the_subject_covers_the_asked_part_of_the_frame(share):
-    """The study varies the share; the mask must have it, in every view."""
+def test_the_subject_covers_the_given_part_of_the_frame(share):
+    """The mask has this share in every view, for any aspect of the frame."""
     for size in ((280, 280), (420, 280), (210, 280)):
         assert ellipse(share, size).float().mean().item() == pytest.approx(share, rel=0.02)
     batch = ellipsoid_batch(share, 3, 56, 2)
@@ -216,7 +216,7 @@ def test_the_subject_covers_the_asked_part_of_the_frame(share):
 
 
 def test_knobs_are_combined_and_checked():
-    """Every combination is measured; a key that no case has is named."""
+    """Every combination is a case; an unknown key is named."""
     both = combinations({"recalibration.k": [4, 8], "precision": ["float32"]})
     assert both == [
         {"recalibration.k": 4, "precision": "float32"},

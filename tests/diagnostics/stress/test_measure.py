@@ -1,4 +1,4 @@
-"""The stress test itself: its matrix is complete, and it finds what it must find."""
+"""The stress test: its cells are complete, and it detects defects of stages."""
 
 import dataclasses
 import json
@@ -16,7 +16,7 @@ from tests.helpers.verbs import ghgs
 
 
 def test_the_full_run_is_large_and_no_stage_dominates():
-    """At least twenty seeds in each cell, no stage more than a fifth."""
+    """At least twenty seeds in each cell; no stage has more than a fifth of the cases."""
     cases = Counter()
     for stage, _, seeds in tasks_of():
         assert seeds >= 20
@@ -28,15 +28,15 @@ def test_the_full_run_is_large_and_no_stage_dominates():
 
 
 @pytest.mark.parametrize("family", list(PLANTED))
-def test_a_value_that_vanishes_is_found(family):
-    """A stage that hides NaN or infinity must have a reason."""
+def test_a_value_without_effect_is_found(family):
+    """A stage whose outputs are finite although an input is not fails, unless it has a reason."""
     stage = STAGES["unit vectors"]
     hide = dataclasses.replace(stage, run=lambda v: {"unit": stage.run(v)["unit"].nan_to_num()}, gradients=())
     assert measure(hide, family, 3, ["float32"])[0]["failures"] == 3
 
 
 def test_a_value_that_reaches_another_case_is_found():
-    """A mean over cases spreads what is not finite."""
+    """A mean over cases spreads a value that is not finite."""
     stage = STAGES["unit vectors"]
     mix = dataclasses.replace(
         stage, run=lambda v: {"unit": stage.run(v)["unit"] + v["vectors"].mean(0)}, gradients=()
@@ -58,13 +58,13 @@ def test_the_condition_of_a_case_does_not_depend_on_others():
 
 
 def test_a_run_in_other_processes_has_the_same_rows():
-    """Cases depend on stage, family and seed alone."""
+    """A case depends on its stage, family and seed only."""
     tasks = [("unit vectors", family, 2) for family in ("ordinary", "zero_quaternion")]
     assert run_tasks(tasks, 0) == run_tasks(tasks, 1)
 
 
 def test_a_stage_that_raises_is_a_failure(monkeypatch, capsys, tmp_path):
-    """In one line, and the other stages are measured."""
+    """It is reported in one line for each dtype, and the other stages are measured."""
     broken = dataclasses.replace(STAGES["cosine"], run=lambda v: {"cosines": v + 1})
     monkeypatch.setitem(STAGES, "cosine", broken)
     settings = ("quick=true", "workers=0", f"hydra.run.dir={tmp_path}")
@@ -79,7 +79,7 @@ def test_a_stage_that_raises_is_a_failure(monkeypatch, capsys, tmp_path):
 
 
 def test_a_mask_on_the_result_instead_of_the_argument_is_found():
-    """Its gradient is NaN."""
+    """The gradient of such a stage is NaN."""
 
     def masked(v):
         direction = v["vectors"] / v["vectors"].norm(dim=-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Defects planted one at a time in the code of the stages: the stress test reports each of them."""
+"""The stress test reports each of a list of defects, which are planted in the code one at a time."""
 
 import ast
 import importlib
@@ -23,7 +23,7 @@ DEFECTS = json.loads(Path(__file__).with_name("planted.json").read_text())
 
 
 def plant(at: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Change a function wherever it is known, until the test ends."""
+    """Change the code of a function until the test ends."""
     file, name = found(CODE, at)
     module = importlib.import_module(file.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
     function = inspect.unwrap(attrgetter(name)(module))
@@ -35,13 +35,13 @@ def plant(at: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def failures(stage: str, family: str, dtype: str) -> int:
-    """How many of three cases fail."""
+    """Number of failures among three cases."""
     return sum(row["failures"] for row in measure(STAGES[stage], family, 3, [dtype]))
 
 
 @pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect["what"])
 def test_a_changed_line_is_reported(defect, monkeypatch):
-    """Without the defect the same cases pass."""
+    """The same cases pass without the defect."""
     case = defect["stage"], defect["family"], defect["dtype"]
     assert failures(*case) == 0
     plant(defect["at"], defect["change"], monkeypatch)
@@ -49,20 +49,20 @@ def test_a_changed_line_is_reported(defect, monkeypatch):
 
 
 def test_a_confidence_without_its_limit_is_reported(monkeypatch):
-    """exp(100) is infinite in float32, and is not in float64."""
+    """exp(100) is infinite in float32, but not in float64."""
     monkeypatch.setattr(stages.activation, "confidence_of", lambda c: 1 + c.exp())
     assert failures("depth activation", "saturated", "float32") > 0
 
 
 def test_a_norm_without_its_epsilon_is_reported(monkeypatch):
-    """Tokens of 0 have no direction."""
+    """The norm of tokens of 0 is 0."""
     for head in stages.HEADS.values():
         monkeypatch.setattr(head.norm, "eps", 0.0)
     assert failures("dense head", "zero_features", "float32") > 0
 
 
 def test_tiles_from_back_to_front_are_reported(monkeypatch):
-    """The order of the splats of a tile is that of their depths."""
+    """Splats of a tile must be sorted by their depths."""
     right = cpu.scatter
 
     def reversed_(first, last, shifts, depths, *rest):

@@ -1,4 +1,4 @@
-"""What ``ghgs stress quick=true`` runs: every stage on every family, with no failure."""
+"""The cases of ``ghgs stress quick=true``: every stage on every family, without a failure."""
 
 import pytest
 
