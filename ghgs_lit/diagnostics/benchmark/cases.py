@@ -27,18 +27,12 @@ KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
 class Case:
     """A model to measure."""
 
-    preset: str
-    knobs: Mapping[str, Any]  #: changed values by key
+    label: str  #: its preset and changed values, such as ``fast recalibration.k=4``; unique
     predictor: Predictor  #: with a model in evaluation mode, on its device
     renderer: Renderer
     budget_db: float | None  #: PSNR that the preset may lose against the reference; None: no budget
     max_rel_diff: float | None  #: allowed ``rel_diff`` from the reference; None: any
     is_trained: bool
-
-    @property
-    def label(self) -> str:
-        """Unique name of the case."""
-        return " ".join([self.preset, *(f"{key}={value}" for key, value in self.knobs.items())])
 
 
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
@@ -101,11 +95,12 @@ def make_cases(
         plain = OmegaConf.to_container(node, resolve=True)
         model = _model(plain, checkpoint, state, seed, device).to(device).eval()
         state = state or model.state_dict()
+        label = " ".join([name, *(f"{key}={value}" for key, value in change.items())])
         # Budgets hold for presets without knobs.
         budgets = (None if change else skip.get(key) for key in ("budget_db", "max_rel_diff"))
         predictor = Predictor(model, precision=plain["precision"])
         renderer = build(plain["renderer"], "renderer")
-        cases.append(Case(name, change, predictor, renderer, *budgets, checkpoint is not None))
+        cases.append(Case(label, predictor, renderer, *budgets, checkpoint is not None))
     return cases
 
 

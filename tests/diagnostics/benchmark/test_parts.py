@@ -61,7 +61,7 @@ def result(model, scene, probe):
 
 
 def case(model, name, renderer):
-    return Case(name, {}, model, renderer, None, None, False)
+    return Case(name, model, renderer, None, None, False)
 
 
 def test_cases_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, monkeypatch):
