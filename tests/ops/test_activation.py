@@ -1,4 +1,4 @@
-"""Kernels of the activations of Gaussians, of a CPU and of a GPU, against plain PyTorch in float64."""
+"""CPU and GPU kernels of the activations of Gaussians, compared with plain PyTorch in float64."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
 
 def scene(b, v, height, width, scale=1.0, color=True):
-    """Raw attributes of every pixel of the subject but some, and depths with steps."""
+    """Raw attributes of most foreground pixels, and noisy depths."""
     g = torch.Generator().manual_seed(0)
     batch = with_soft_rims(make_batch(b, v, height, width))
     depth = VisualHull()(batch).near + 0.01 * torch.randn(batch.masks.shape, generator=g)
@@ -37,13 +37,13 @@ RAW = ("offset", "scale", "rotation", "opacity", "color")
 
 
 def to(value, *where):
-    """Floating-point tensors in another precision, all on another device."""
+    """Apply ``Tensor.to(*where)`` to floating-point tensors, and move the others to ``DEVICE``."""
     return map_tensors(value, lambda x: x.to(*where) if x.is_floating_point() else x.to(DEVICE))
 
 
 def gaussians_and_gradients(head, raw, batch, points, maps, slopes):
-    """Attributes, and the gradients of their products with ``slopes`` by raw attributes
-    and points."""
+    """Attributes, and the gradients of their products with ``slopes`` with respect to raw attributes and
+    points."""
     leaves = [getattr(raw, name) for name in RAW] + [points.pixels]
     leaves = [None if x is None else x.detach().clone().requires_grad_() for x in leaves]
     raw = dataclasses.replace(raw, **dict(zip(RAW, leaves, strict=False)))
@@ -63,7 +63,7 @@ def errors(found, exact):
 
 
 def assert_as_exact_as_pytorch(head, *inputs):
-    """Four times the error of plain float32 and four roundings, of the largest value, at most."""
+    """The error is at most four times that of plain float32, plus four roundings of the largest value."""
     generator = torch.Generator().manual_seed(1)
     n = len(inputs[0].image)
     slopes = [torch.randn(n, *size, generator=generator) for size in ((3,), (4,), (3,), (), (3,))]
@@ -73,7 +73,7 @@ def assert_as_exact_as_pytorch(head, *inputs):
     there = [to(x, DEVICE) for x in inputs]
     with kernels("cpu") as called:
         plain, slopes_of_plain = gaussians_and_gradients(head, *there, slopes)
-    assert called == []  # those of a CPU have no gradient
+    assert called == []  # CPU kernels have no gradient
     exact, exact_slopes = gaussians_and_gradients(head, *(to(x, torch.float64) for x in there), slopes)
     with kernels() as called:
         found, found_slopes = gaussians_and_gradients(head, *there, slopes)
@@ -93,8 +93,7 @@ def assert_as_exact_as_pytorch(head, *inputs):
 def test_values_and_gradients_are_as_exact_as_plain_pytorchs(
     axes, b, v, height, width, scale, limit, is_soft
 ):
-    """With saturated attributes, with and without mattes, limits of offsets,
-    and changes of colours."""
+    """Cases cover saturated attributes, and mattes, offset limits and colour changes on and off."""
     raw, batch, points, maps = scene(b, v, height, width, scale, color=is_soft)
     batch = batch if is_soft else dataclasses.replace(batch, alpha=None)
     options = {"axes": axes, "guide": True, "color_limit": 0.5 * is_soft, "offset_limit": limit}
@@ -103,7 +102,7 @@ def test_values_and_gradients_are_as_exact_as_plain_pytorchs(
 
 
 def test_rotations_near_none_at_all():
-    """The zero quaternion has no direction; the gradient of short ones is bounded."""
+    """The zero quaternion has no direction; the gradient of short quaternions is bounded."""
     raw, *others = scene(1, 3, 28, 28)
     short = torch.tensor([-1.0, 0.0, 0.0, 0.0]).repeat(len(raw.image), 1)
     short[1::3, 1], short[2::3, 2] = 1e-30, -0.03
@@ -115,7 +114,7 @@ def test_rotations_near_none_at_all():
 
 
 def test_a_pixel_that_is_listed_twice_has_the_sum_of_both_gradients():
-    """Plans of a GPU fill up the rows of a batch with the last one."""
+    """On a GPU, the rows of a batch are padded by repeating the last one."""
     raw, *others = scene(1, 3, 28, 28)
     rows = torch.cat((torch.arange(len(raw.image)), torch.tensor([len(raw.image) - 1] * 9)))
     values = {name: getattr(raw, name)[rows] for name in ("descriptors", *RAW, "image", "pixel")}
@@ -124,7 +123,7 @@ def test_a_pixel_that_is_listed_twice_has_the_sum_of_both_gradients():
 
 
 def strided(x):
-    """The same values in every second place of the last axis."""
+    """The same values with a stride of 2 along the last axis."""
     return torch.stack((x, torch.zeros_like(x)), -1)[..., 0]
 
 
@@ -162,7 +161,7 @@ def test_no_gaussian_has_no_gradient():
 
 
 def test_what_the_kernels_do_not_know_is_plain_pytorch():
-    """Float64; gradients of photographs; the published attributes."""
+    """Float64, gradients of input views, and the published attributes have no kernel."""
     inputs = [to(x, DEVICE) for x in scene(1, 2, 28, 28)]
     wide = [to(x, torch.float64) for x in inputs]
     images = inputs[1].images.clone().requires_grad_()

@@ -1,5 +1,5 @@
-"""Activations that keep a gradient whatever a step has done to their head, and axes of surfaces whose
-normals are known."""
+"""Activations that keep a gradient after any step of their head, and axes of surfaces with known
+normals."""
 
 import dataclasses
 
@@ -33,8 +33,7 @@ def test_inside_the_limit_it_is_the_plain_function(ours, plain):
 @pytest.mark.parametrize("ours", [bounded_sigmoid, bounded_tanh])
 @pytest.mark.parametrize("raw", FAR_OUT)
 def test_a_gradient_leads_back_from_beyond_the_limit(ours, raw):
-    """A plain sigmoid has a gradient of 0 from 17 on:
-    one large step ended the training of a head."""
+    """A plain sigmoid has a gradient of 0 from 17 on: one large step ended the training of a head."""
     for sign in (-1, 1):
         x = torch.tensor(raw, requires_grad=True)
         (gradient,) = torch.autograd.grad(sign * ours(x), x)
@@ -45,7 +44,7 @@ def test_a_gradient_leads_back_from_beyond_the_limit(ours, raw):
 @pytest.mark.parametrize("name", list(BOUNDED))
 @pytest.mark.parametrize("raw", [-90.0, 90.0])
 def test_a_saturated_depth_recovers(name, raw):
-    """Adam brings a raw value back that a step of an adversarial learning rate sent away."""
+    """Adam recovers a raw value after a step with an adversarial learning rate."""
     near, far = torch.tensor(1.5), torch.tensor(2.5)
     x = torch.tensor(raw, requires_grad=True)
     optimizer = torch.optim.Adam([x], lr=1.0, betas=(0.5, 0.9))
@@ -62,7 +61,7 @@ def attributes(*raws, limit=0.05):
 
 
 def test_offsets_go_as_far_as_their_limit():
-    """Without one, as published, as far as the network says: 5 cm for a raw value of 1."""
+    """Without a limit, as published, offsets are linear in the raw value: 5 cm for a raw value of 1."""
     raws = [torch.full(shape, 40.0) for shape in ((1, 3), (1, 3), (1, 4), (1,), (1,))]
     for limit, expected in ((0.05, 0.05), (0.2, 0.2), (None, 2.0)):
         offset = attributes(*raws, limit=limit)[0]
@@ -71,7 +70,7 @@ def test_offsets_go_as_far_as_their_limit():
 
 @pytest.mark.parametrize("raw", FAR_OUT)
 def test_saturated_attributes_keep_a_gradient(raw):
-    """Offsets had none from 10 on, scales and opacities none from 20 on."""
+    """Offsets had no gradient from 10 on, scales and opacities none from 20 on."""
     raws = [torch.full(shape, raw, requires_grad=True) for shape in ((1, 3), (1, 3), (1, 4), (1,))]
     values = attributes(*raws, torch.full((1,), 0.004))
     towards_zero = 1.0 if raw > 0 else -1.0
@@ -83,8 +82,8 @@ def test_saturated_attributes_keep_a_gradient(raw):
 
 
 def test_the_rotation_near_minus_identity_has_a_bounded_gradient():
-    """Raw values near (-1, 0, 0, 0) make the zero quaternion: there the gradient grows
-    as 1 / |q|."""
+    """Raw values near (-1, 0, 0, 0) give the zero quaternion q, near which the gradient grows as
+    1 / |q|."""
     rotation = torch.tensor([[-1.0, 1e-9, 0.0, 0.0]], requires_grad=True)
     zeros = torch.zeros(1, 3)
     quaternions = attributes(zeros, zeros, rotation, torch.zeros(1), torch.ones(1))[2]
@@ -93,7 +92,7 @@ def test_the_rotation_near_minus_identity_has_a_bounded_gradient():
 
 
 def test_the_release_s_depth_has_a_finite_gradient_at_its_pole():
-    """At -1e-8 the depth is infinite and replaced; replacing the result left a gradient of NaN."""
+    """At -1e-8 the depth is infinite and is replaced; replacing only the result left a gradient of NaN."""
     x = torch.tensor([-1e-8, 0.1], requires_grad=True)
     depth = inverse_linear(x)
     assert depth[0].isinf()
@@ -103,12 +102,12 @@ def test_the_release_s_depth_has_a_finite_gradient_at_its_pole():
 
 
 def test_a_confidence_of_any_raw_value_is_finite():
-    """Published heads take an exponential, which overflows from 89 on."""
+    """Published heads use an exponential, which overflows from 89 on."""
     assert confidence_of(torch.tensor([-1e4, 0.0, 100.0, 1e4])).isfinite().all()
 
 
 def axes_of(depth, valid, cameras):
-    """Matrices [N, 3, 3] of the axes of all valid pixels."""
+    """Matrices [N, 3, 3] of the surface axes of all valid pixels."""
     image, pixel = valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
     return quaternion_to_matrix(surface_axes(DepthMaps(depth, valid, depth), cameras, image, pixel))
 
@@ -120,8 +119,8 @@ def camera_axes(batch):
 
 
 def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
-    """Against the gradient of its equation; the axes are a rotation of the camera's,
-    by the least angle."""
+    """Normals match the gradient of the surface's equation; the axes are the camera axes rotated by the
+    least angle."""
     cameras = ring(2, 3, 140, 112)
     masks, depths = ellipsoid(cameras)
     batch = dataclasses.replace(make_batch(2, 3, 140, 112), masks=masks, depths=depths)
@@ -129,7 +128,7 @@ def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
     points = unproject_maps(depths, cameras)[masks]
     normal = torch.nn.functional.normalize((CENTER - points) / RADII.square(), dim=-1)
     cosine = (found[:, :, 2] * normal).sum(-1)
-    assert cosine.quantile(0.05) > 0.99  # the rim is a slope between neighbours, which bends
+    assert cosine.quantile(0.05) > 0.99  # at the rim, finite differences of a curved surface
     assert cosine.min() > 0.7
     torch.testing.assert_close(found.det(), torch.ones(len(found)))
     camera = camera_axes(batch)
@@ -141,8 +140,7 @@ def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
 
 
 def slanted(slope_x, slope_y, dtype=torch.float64):
-    """A plane z = 2 + a x + b y before a camera at the origin that looks along z,
-    with its depths."""
+    """Depths of the plane z = 2 + a x + b y in front of a camera at the origin that looks along z."""
     size, fx, fy, skew = 20, 30.0, 36.0, 3.0
     lens = torch.tensor([[fx, skew, size / 2 + 1], [0, fy, size / 2 - 2], [0, 0, 1]], dtype=dtype)
     centers = torch.arange(size, dtype=dtype) + 0.5
@@ -156,19 +154,18 @@ def slanted(slope_x, slope_y, dtype=torch.float64):
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.0), (1.5, 0.0), (-0.4, 1.0)])
 def test_planes_are_exact_up_to_their_border(a, b):
-    """One-sided differences at the border of the image and of the mask are exact on a plane,
-    too."""
+    """One-sided differences at the border of the image and of the mask are also exact on a plane."""
     depth, cameras = slanted(a, b)
     valid = torch.ones_like(depth, dtype=torch.bool)
     valid[..., 7:9, 3:5] = False
-    depth[~valid] += 0.01  # near the plane, yet not the subject's
+    depth[~valid] += 0.01  # near the plane, but in the background
     normal = axes_of(depth, valid, cameras)[..., 2]
     expected = torch.nn.functional.normalize(torch.tensor([-a, -b, 1.0], dtype=depth.dtype), dim=0)
     torch.testing.assert_close(normal, expected.expand_as(normal))
 
 
 def test_surfaces_do_not_mix():
-    """A step of a metre, and what lies outside the mask, say nothing of the normal."""
+    """A depth step of a metre and pixels outside the mask do not affect the normal."""
     depth, cameras = slanted(0.0, 0.0)
     depth[..., 10:] += 1.0
     depth[..., :3] = 77.0
@@ -179,7 +176,7 @@ def test_surfaces_do_not_mix():
 
 
 def test_lonely_pixels_have_the_axes_of_their_camera():
-    """Pixels without a neighbour, also in corners of the image."""
+    """Isolated pixels, also in corners of the image."""
     batch = make_batch(1, 3)
     valid = torch.zeros_like(batch.masks)
     valid[..., ::55, ::55] = True
@@ -189,7 +186,7 @@ def test_lonely_pixels_have_the_axes_of_their_camera():
 
 
 def test_axes_turn_with_the_world_and_do_not_depend_on_batch_mates():
-    """The same photographs in a world with other axes and origin, and alone."""
+    """The same input views in a world with other axes and origin, and as a single batch element."""
     batch = make_batch(2, 3)
     found = axes_of(batch.depths, batch.masks, batch.cameras)
     turn = quaternion_to_matrix(torch.tensor([0.3, -0.5, 0.7, 0.2]))

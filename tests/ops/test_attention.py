@@ -1,4 +1,4 @@
-"""The CPU kernel for attention against PyTorch in float64."""
+"""CPU kernel of attention, compared with PyTorch in float64."""
 
 import numba
 import pytest
@@ -16,7 +16,7 @@ DTYPES = [torch.float32, torch.bfloat16]
 
 
 def scene(n, heads, tokens, width, dtype, scale=1.0, seed=0):
-    """Queries, keys and values [n, heads, tokens, width], parts of one tensor as in the encoder."""
+    """Queries, keys and values [n, heads, tokens, width], views of one tensor as in the encoder."""
     g = torch.Generator().manual_seed(seed)
     qkv = torch.randn(n, tokens, 3, heads, width, generator=g)
     qkv[:, :, :2] *= scale
@@ -24,15 +24,14 @@ def scene(n, heads, tokens, width, dtype, scale=1.0, seed=0):
 
 
 def error(found, q, k, v):
-    """Root mean square of the difference to float64, relative to that of the result."""
+    """Root mean square of the error against float64, relative to the root mean square of the result."""
     expected = F.scaled_dot_product_attention(q.double(), k.double(), v.double()).transpose(1, 2)
     return ((found.double() - expected).square().mean() / expected.square().mean()).sqrt()
 
 
 def limit(q, k, v):
-    """A hundred times what rounding the arguments once changes, and one rounding: the budget
-    of a kernel in ``ghgs stress``. How near PyTorch comes is the luck of a processor's order
-    of summation."""
+    """Error budget of summation: a hundred times the effect of rounding the arguments once, and one
+    rounding."""
     g, eps = torch.Generator().manual_seed(1), torch.finfo(torch.float32).eps
     moved = [x.double() * (1 + eps * torch.randn(x.shape, generator=g).sign()) for x in (q, k, v)]
     return 100 * (eps + error(F.scaled_dot_product_attention(*moved).transpose(1, 2), q, k, v))
@@ -56,7 +55,7 @@ def pytorch(q, k, v):
     ],
 )
 def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype):
-    """The kernel is as accurate as its condition allows for all sizes around its block sizes."""
+    """The kernel is as accurate as the condition number allows, at all sizes around its block sizes."""
     for scale in (0.0, 1.0, 4.0):
         q, k, v = scene(n, heads, tokens, width, dtype, scale)
         found = cpu.attend_heads(q, k, v)
@@ -74,8 +73,8 @@ def parts(queries, keys, dtype):
 
 
 def rising(keys):
-    """Scores that rise and fall by hundreds: the running maximum changes in every block of keys, or only in
-    the first."""
+    """Scores that rise or fall by hundreds: the running maximum changes in every block of keys, or only
+    in the first."""
     v = scene(1, 1, 5 * KEYS, 32, torch.float32)[2]
     return torch.ones_like(v), keys(torch.linspace(-300, 300, 5 * KEYS)[:, None]).expand_as(v) / 32**0.5, v
 
@@ -86,7 +85,7 @@ def of_types(of_scores, of_values):
 
 
 def apart():
-    """Channels that are not contiguous."""
+    """The same values with channels that are not contiguous."""
     q, k, v = scene(1, 2, 50, 32, torch.float32)
     return tuple(x.transpose(2, 3).contiguous().transpose(2, 3) for x in (q, k, v))
 
@@ -108,8 +107,8 @@ INPUTS = {
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_inputs_of_any_kind(name):
-    """Numbers of queries and keys that differ, scores of any size, other types than that of the values, which
-    the result has, and strides."""
+    """Cases cover different numbers of queries and keys, scores of any size, strides, and dtypes other than
+    that of the values, which is the dtype of the result."""
     args = INPUTS[name]
     found = cpu.attend_heads(*args)
     assert found.dtype == args[2].dtype
@@ -117,7 +116,7 @@ def test_inputs_of_any_kind(name):
 
 
 def test_weights_below_the_smallest_float_count_for_nothing():
-    """Keys with tiny weights do not add up to an error, even with huge values."""
+    """Keys with tiny weights do not accumulate to an error, even with huge values."""
     q = torch.full((1, 1, 1, 32), 10.0)
     k = torch.zeros(1, 1, 64, 32)
     k[0, 0, 0] = 10
@@ -129,7 +128,7 @@ def test_weights_below_the_smallest_float_count_for_nothing():
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_what_is_not_finite_reaches_the_same_values_as_in_pytorch(dtype, bad):
-    """NaN and infinity are neither hidden nor spread to other queries or heads."""
+    """NaN and infinity are neither hidden nor propagated to other queries or heads."""
     for part in range(3):
         q, k, v = (x.clone() for x in scene(1, 2, 300, 32, dtype))
         (q, k, v)[part][0, 1, 290, 3] = bad
@@ -142,7 +141,7 @@ def test_what_the_kernel_is_asked_for(monkeypatch):
     """The kernel is used only where it is supported and faster."""
     monkeypatch.setattr(pool, "features", lambda: {"avx2", "fma"})
     q, _, v = scene(1, 4, 1024, 32, torch.float32)
-    assert not attend.has_kernel(q, q, v, None)  # a gradient may be needed
+    assert not attend.has_kernel(q, q, v, None)  # autograd is enabled
     with torch.no_grad():
         assert attend.has_kernel(q, q, v, None)
         assert not attend.has_kernel(q[:, :, :100], q[:, :, :100], v[:, :, :100], None)  # small
@@ -156,7 +155,7 @@ def test_what_the_kernel_is_asked_for(monkeypatch):
 
 
 def test_features_of_the_processor_may_be_limited(monkeypatch):
-    """Features that a user disables by Numba's setting are not used."""
+    """Processor features that a user disables in Numba's settings are not used."""
     monkeypatch.setattr(numba.config, "CPU_FEATURES", "+made_up,-avx512f")
     assert "made_up" in processor_features()
     assert "avx512f" not in processor_features()
@@ -180,14 +179,13 @@ for n, heads, queries, keys, width in ((1, 1, 1, 1, 32), (2, 3, 7, 7, 64), (1, 2
 
 
 def test_attention_without_512_bit_vectors():
-    """The kernel of a processor with AVX2 alone is as accurate;
-    a wider one is limited by Numba's setting."""
+    """The kernel for AVX2 is as accurate; Numba's settings select it on processors with AVX-512."""
     if not {"avx2", "fma"} <= processor_features():
         pytest.skip("needs AVX2")
     if "avx512f" in processor_features():
         run_python(NARROW, NUMBA_CPU_FEATURES="-avx512f")
     else:
-        exec(NARROW, {})  # this processor is such a one
+        exec(NARROW, {})  # this processor has no AVX-512
 
 
 def test_tiles_fit_the_blocks():

@@ -1,4 +1,4 @@
-"""Machine code on disk: of the same sources and whole, or made anew."""
+"""Cached machine code is loaded only if it is intact and built from the same sources."""
 
 import ast
 import importlib.util
@@ -14,13 +14,13 @@ from ghgs_lit.ops import compile
 from ghgs_lit.ops.compile import FirstCompilation
 
 PACKAGE = Path(ghgs_lit.__file__).parent
-#: Kernels lie in these folders, each with the constants that they read.
+#: Folders of kernels and the constants that they use.
 FOLDERS = sorted({path.parent for path in PACKAGE.glob("ops/*/*.py") if "ops.compile" in path.read_text()})
 
 
 @pytest.fixture
 def hits(tmp_path, monkeypatch):
-    """Runs a kernel in a module that is read anew; gives how often it came from the cache."""
+    """A function that reloads a module, runs its kernel and returns the number of cache hits."""
     source = tmp_path / "scaled.py"
     source.write_text(
         "from ghgs_lit.ops import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
@@ -40,7 +40,7 @@ def hits(tmp_path, monkeypatch):
 
 
 def test_machine_code_of_other_sources_is_not_taken_from_the_cache(hits):
-    """Machine code of older sources is never loaded; that of the same sources is."""
+    """Machine code built from other sources is never loaded; code of the same sources is."""
     assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]
 
 
@@ -62,7 +62,7 @@ def test_a_damaged_file_of_the_cache_is_made_anew(hits, tmp_path, suffix, damage
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
 def test_the_key_covers_all_that_kernels_read(folder, monkeypatch):
-    """A changed file of the folder changes the key, and constants come from no other place."""
+    """A changed file of the folder changes the key, and constants are imported from no other folder."""
     files = sorted({*folder.glob("*.py"), *(PACKAGE / "ops").glob("*.py")})
     modules = {".".join(("ghgs_lit", *file.relative_to(PACKAGE).with_suffix("").parts)) for file in files}
     names = {name for module in modules for name in (module, module.rpartition(".")[0])}
@@ -73,7 +73,7 @@ def test_the_key_covers_all_that_kernels_read(folder, monkeypatch):
                     assert node.module in names, file
     compile._digest.cache_clear()
     before, read = compile._digest(folder), Path.read_bytes
-    for file in files:  # such as activation/__init__.py, whose SAME is a constant of machine code
+    for file in files:  # such as activation/__init__.py, whose SAME is compiled into machine code
         changed = lambda path, file=file: read(path) + b"#" * (path == file)  # noqa: E731
         monkeypatch.setattr(Path, "read_bytes", changed)
         compile._digest.cache_clear()
@@ -82,15 +82,14 @@ def test_the_key_covers_all_that_kernels_read(folder, monkeypatch):
 
 
 def test_the_first_compilation_says_so(capsys, monkeypatch):
-    """A first prediction that compiles for a minute must not look as if it hung;
-    workers say nothing."""
-    numba.njit(lambda x: x)(1)  # the listener of this process has spoken
+    """A first prediction that compiles for a minute must not appear to hang; workers print nothing."""
+    numba.njit(lambda x: x)(1)  # makes the listener of this process print
     capsys.readouterr()
     with event.install_listener("numba:compile", FirstCompilation()):
         for number in range(2):
             numba.njit(lambda x, y=number: x + y)(1)
     assert capsys.readouterr().err.count("compiling kernels for this processor") == 1
-    monkeypatch.setattr(FirstCompilation, "is_said", True)  # as in the processes of a pool
+    monkeypatch.setattr(FirstCompilation, "is_said", True)  # as in worker processes
     with event.install_listener("numba:compile", FirstCompilation()):
         numba.njit(lambda x: x - 1)(1)
     assert "compiling" not in capsys.readouterr().err

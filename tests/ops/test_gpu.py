@@ -1,4 +1,4 @@
-"""Operators of the package: kernels of a GPU, which compile without one."""
+"""GPU kernels of the package, which compile without a GPU."""
 
 import dataclasses
 import os
@@ -23,8 +23,7 @@ CAPABILITIES = ("80", "86", "89", "90")
 
 
 def test_every_kernel_compiles_for_gpus():
-    """For NVIDIA's A100, RTX 30, RTX 40 and H100, down to machine code,
-    with registers for all that a thread holds."""
+    """Kernels compile to machine code of A100, RTX 30, RTX 40 and H100 without spilled registers."""
     pytest.importorskip("triton")
     env = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     command = [sys.executable, str(SCRIPT), *CAPABILITIES]
@@ -39,12 +38,12 @@ def test_every_kernel_compiles_for_gpus():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="Triton works there")
 def test_without_a_driver_the_reason_is_said_and_plain_pytorch_used(monkeypatch):
-    """As on a machine without a C compiler, which Triton needs once."""
+    """As on a machine without a C compiler, which Triton needs for its first launch."""
     pytest.importorskip("triton")
     with pytest.warns(UserWarning, match=r"Triton: expected to start kernels; found .*; plain"):
         assert not dispatch._triton_works.__wrapped__()
     monkeypatch.setitem(sys.modules, "triton.runtime", None)
-    assert not dispatch._triton_works.__wrapped__()  # not installed: nothing to say
+    assert not dispatch._triton_works.__wrapped__()  # not installed: no warning
 
 
 def test_a_switch_of_tests_and_nothing_else_chooses_kernels():
@@ -59,7 +58,7 @@ def test_a_switch_of_tests_and_nothing_else_chooses_kernels():
 
 
 def test_a_prediction_and_its_gradients_with_kernels_are_plain_pytorchs():
-    """All kernels together, in a model with rounds, on two subjects."""
+    """Test all kernels together, in a model with refinement rounds, on two subjects."""
     model = make_model("model=recurrent").to(DEVICE)
     batch = make_batch(2, 3, 28, 28)
 
@@ -73,12 +72,12 @@ def test_a_prediction_and_its_gradients_with_kernels_are_plain_pytorchs():
         sum(getattr(learned, name).square().sum() for name in ATTRIBUTES).backward()
         return found, torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
 
-    # Whatever a test before has set: rounding factors would be other numbers.
+    # Independent of settings left by other tests: TF32 would change the results.
     with exact(DEVICE.type), mock.patch.object(dispatch, "DEVICES", set()):
         expected, slopes = predicted()
     with exact(DEVICE.type), kernels() as called:
         found, found_slopes = predicted()
-    # Lists of splats are gsplat's, and the memory of rounds is plain PyTorch's in float32.
+    # gsplat lists the splats, and in float32 the memory of rounds is computed by plain PyTorch.
     assert set(called) == NAMES - {"boxed", "placed", "remember"}
     close(found, expected, 1e-4)
     assert (found_slopes - slopes).norm() < 1e-3 * slopes.norm()

@@ -1,5 +1,4 @@
-"""Kernels that compare Gaussians with photographs, of a CPU and of a GPU, against plain PyTorch in
-float64."""
+"""CPU and GPU kernels of the observations of Gaussians, compared with plain PyTorch in float64."""
 
 import dataclasses
 
@@ -28,8 +27,8 @@ def on_device(kind, *values):
 @pytest.mark.parametrize("spread", [0.0, 0.3, 3.0])
 @pytest.mark.parametrize("is_soft", [False, True])
 def test_values_are_as_exact_as_plain_pytorchs(kind, b, v, height, width, spread, is_soft):
-    """Elements with unequal numbers of Gaussians, or none; Gaussians outside of frames and behind cameras; an
-    image without a subject."""
+    """Cases cover elements with unequal numbers of Gaussians or none, Gaussians outside frames and behind
+    cameras, and an image without a subject."""
     batch = make_batch(b, v, height, width)
     batch = with_soft_rims(batch) if is_soft else batch
     batch.masks[-1, 0] = False
@@ -46,8 +45,8 @@ def test_values_are_as_exact_as_plain_pytorchs(kind, b, v, height, width, spread
     with kernels(kind) as called:
         found = observe(gaussians, batch, rendering)
     assert called == ["observe"]
-    # A pixel is a quotient of products, exact to some roundings of its size: colours differ by as
-    # much of the largest difference of neighbouring pixels. A distance behind the surface is
+    # A pixel coordinate is a quotient of products, exact to some roundings of its size: colours differ by
+    # that fraction of the largest difference of neighbouring pixels. A distance behind the surface is
     # divided by 5 cm.
     pixel = 8 * EPS * max(height, width)
     assert (exact[..., 9] == 0).any() == (spread > 0.2)

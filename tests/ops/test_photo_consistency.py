@@ -1,5 +1,5 @@
-"""How well photographs agree about a depth: against a pixel-by-pixel version on SciPy's interpolation, and
-kernels against plain PyTorch."""
+"""Photo-consistency, compared with a pixel-by-pixel version that uses SciPy's interpolation, and its
+kernels, compared with plain PyTorch."""
 
 import dataclasses
 
@@ -21,8 +21,7 @@ from tests.method.heads.test_gaussian import make_head, run, shake
 
 
 def by_hand(batch, bounds, b, v, row, column, steps):
-    """Agreement at one pixel in float64; views face each other less than the limit in
-    these scenes."""
+    """Agreement at one pixel in float64; in these scenes all views are within the limit of angles."""
     masks = batch.masks[b].double().numpy()
     images = batch.images[b].double().numpy() * masks[:, None]
     intrinsics, extrinsics = (
@@ -65,7 +64,7 @@ def test_agreement_is_that_of_each_ray(size):
 
 
 def test_the_surface_agrees_more_than_what_lies_behind_it():
-    """A subject whose colour is a smooth function of the place, seen by neighbouring views."""
+    """A subject whose colour is a smooth function of position, in neighbouring views."""
     batch = make_batch(1, 4, 56, 56, spread=100.0)
 
     points = unproject_maps(batch.depths, batch.cameras)
@@ -81,7 +80,7 @@ def test_the_surface_agrees_more_than_what_lies_behind_it():
 
 @pytest.mark.parametrize("size", [56, 518])
 def test_half_precision_does_not_reach_the_sweep(size):
-    """A pixel rounded to bfloat16 lies in another place: training would see a broken guide."""
+    """A pixel coordinate rounded to bfloat16 is another pixel, which would break the guide in training."""
     batch = make_batch(1, 4, size, size, spread=100.0)
     bounds = DepthBounds(batch.depths, batch.depths + 0.05)
     expected = photo_consistency(batch, bounds, 2)
@@ -92,7 +91,7 @@ def test_half_precision_does_not_reach_the_sweep(size):
 
 
 def test_opposite_views_say_nothing():
-    """Views from opposite sides see no common surface and must not vote."""
+    """Views from opposite sides share no surface and must not be compared."""
     batch = make_batch(1, 2)
     bounds = VisualHull()(batch)
     assert not photo_consistency(batch, bounds, 4).any()
@@ -126,7 +125,7 @@ def test_the_order_of_views_does_not_matter():
 
 
 def test_heads_ask_for_what_photo_consistency_needs():
-    """Photo-consistency without a guide would be computed and never seen."""
+    """Photo-consistency without a guide would be computed but never used."""
     for options in ({"guide": False, "consistency_depths": 4}, {"guide": True, "consistency_depths": -1}):
         with pytest.raises(InputError, match=r"depth_head\.consistency_depths"):
             DepthHeadOptions(**options)
@@ -149,7 +148,7 @@ def test_splats_see_photo_consistency_and_colors_leave_their_pixels_within_the_l
 
 
 def test_rims_agree_as_if_they_were_not_premultiplied():
-    """Photographs on black are darker where they show the subject in part."""
+    """Images on black are darker where the subject covers a pixel in part."""
     batch = make_batch(1, 3)
     share = (
         0.3 + 0.7 * torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1))
@@ -170,7 +169,7 @@ EPS = torch.finfo(torch.float32).eps
 @pytest.mark.parametrize("steps", [1, 5])
 @pytest.mark.parametrize(("b", "v", "height", "width", "spread"), SCENES)
 def test_the_agreement_is_as_exact_as_plain_pytorchs(kind, b, v, height, width, spread, steps):
-    """Behind cameras and outside frames, too; a view is empty, a pixel is not finite."""
+    """Cases cover points behind cameras and outside frames, an empty view and a pixel that is not finite."""
     batch = make_batch(b, v, height, width, spread=spread)
     batch.masks[-1, 0] = False
     batch.images[0, -1, :, height // 2, width // 2] = torch.nan
@@ -182,9 +181,9 @@ def test_the_agreement_is_as_exact_as_plain_pytorchs(kind, b, v, height, width, 
         with kernels(kind) as called:
             found = photo_consistency(fresh, bounds.to(WHERE[kind]), steps)
         assert called[-1] == "swept"
-        # Pixels are exact to roundings of the frame's size times the depth's ratio to the least
-        # in front of a camera; colours differ by up to 1 a pixel, and the agreement by 1 /
-        # TOLERANCE of that.
+        # Pixel coordinates are exact to roundings of the frame's size times the ratio of the depth to
+        # the smallest depth in front of a camera; colours change by at most 1 per pixel, and the
+        # agreement by 1 / TOLERANCE of that.
         assert ((found >= 0) & (found <= 1)).all()
         difference = (found.cpu() - exact).abs()
         assert difference.max() < 1e-3

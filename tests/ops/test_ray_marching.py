@@ -1,4 +1,4 @@
-"""The search of a CPU along rays against plain PyTorch: the same arithmetic, so the same bits."""
+"""CPU kernel of the search along rays, bitwise equal to plain PyTorch: the arithmetic is the same."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ SCENES = {
 
 
 def spoiled(batch: Batch) -> Batch:
-    """Views with an empty mask, a full one and a single pixel."""
+    """Views with an empty mask, a full mask and a mask of a single pixel."""
     masks = batch.masks.clone()
     masks[0, 0] = False
     masks[-1, 1] = True

@@ -1,5 +1,5 @@
-"""Kernels of the rounds' memory, of a CPU and of a GPU, against plain PyTorch in float64; gradients of a
-CPU's."""
+"""CPU and GPU kernels of the memory of rounds, and gradients on a CPU, compared with plain PyTorch in
+float64."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from ghgs_lit.ops.dispatch import OPERATORS
 from ghgs_lit.ops.round_memory import remembered
 from tests.helpers.kernels import DEVICE, WHERE, kernels
 
-#: Gaussians, views, channels of a view, width of the memory, and values that are known beside them.
+#: Gaussians, views, channels of a view, width of the memory, and number of additional inputs.
 SIZES = [
     (1111, 4, 11, 48, 13),
     (33, 2, 11, 17, 13),
@@ -22,7 +22,7 @@ SIZES = [
 
 
 def scene(count, views, channels, hidden, known):
-    """Five layers, and their inputs: observations, what is known, and the memory before."""
+    """Five layers and their inputs: observations, additional inputs and the previous memory."""
     torch.manual_seed(0)
     sizes = ((channels, hidden), (hidden, hidden), (4 * hidden + known, 2 * hidden), (2 * hidden, hidden))
     layers = nn.Sequential(*(nn.Linear(*size) for size in (*sizes, (hidden, hidden))))
@@ -42,7 +42,7 @@ def by_kernel(kind, layers, rows):
 @pytest.mark.parametrize("size", SIZES)
 @torch.no_grad()
 def test_the_kernel_remembers_what_plain_pytorch_does(kind, size):
-    """To the rounding of factors to TF32 on a GPU, and of float32 elsewhere."""
+    """The tolerance follows from rounding to TF32 on a GPU, and to float32 elsewhere."""
     layers, rows = scene(*size)
     expected = remembered(layers.double(), *(x.double() for x in rows))
     found = by_kernel(kind, layers.float(), rows)
@@ -53,10 +53,10 @@ def test_the_kernel_remembers_what_plain_pytorch_does(kind, size):
 
 @pytest.mark.parametrize("size", [(2500, 4, 11, 48, 13), *SIZES[1:]])
 def test_gradients_are_those_of_plain_pytorch(size):
-    """Those of more Gaussians than one task has, of views that show the same,
-    and of a single Gaussian."""
+    """Cases cover more Gaussians than one task has, views with equal observations, and a single
+    Gaussian."""
     layers, rows = scene(*size)
-    rows[0][::3, 1] = rows[0][::3, -1]  # two views without the Gaussian show the same
+    rows[0][::3, 1] = rows[0][::3, -1]  # as in two views without the Gaussian
     weights = torch.randn(size[0], size[3])
 
     def gradients(dtype):
@@ -91,7 +91,7 @@ def test_what_is_not_finite_reaches_no_other_gaussian(kind, row):
 
 
 def test_where_the_kernel_is_used(monkeypatch):
-    """Not in another precision, or where a processor has no fused products."""
+    """The kernel is not used in other precisions or on processors without fused multiply-add."""
     monkeypatch.setattr(pool, "features", lambda: {"avx2", "fma"})
     x = torch.ones(3)
     assert pool.multiplies(x)
@@ -105,7 +105,7 @@ def test_where_the_kernel_is_used(monkeypatch):
 @pytest.mark.parametrize("has_gradient", [False, True])
 @pytest.mark.parametrize("rounding", [False, True])
 def test_float32_and_gradients_are_plain_pytorchs(rounding, has_gradient):
-    """On a GPU where products may not round to TF32, and where a gradient is wanted."""
+    """The GPU kernel is not used where TF32 is disabled or a gradient is required."""
     inputs = [x.to(DEVICE) for x in scene(3, 2, 11, 48, 24)[1]]
     with kernels(), torch.set_grad_enabled(has_gradient), _float32(DEVICE.type, rounding):
         assert OPERATORS["remember"].has_kernel(*inputs, []) == (rounding and not has_gradient)

@@ -1,4 +1,4 @@
-"""Tasks of a CPU's kernels write apart: an order of threads must not show."""
+"""Tasks of CPU kernels write to disjoint memory, so that results do not depend on the threads."""
 
 import dataclasses
 
