@@ -43,7 +43,7 @@ from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_lit.data.view import area_image
 from ghgs_lit.execution import Predictor
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.method.rounds.gains import divided
+from ghgs_lit.method.rounds.gains import divide_by_gains
 from ghgs_lit.metrics.functional import decibels, psnr, psnr_box_40
 from ghgs_lit.metrics.regions import box_of, mean_over
 from ghgs_lit.rendering import Renderer
@@ -204,7 +204,7 @@ def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
     if not rig or not rig.gains:
         return batch
     logs = np.log([rig.gains[name] for name in batch.views[0]])
-    return divided(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
+    return divide_by_gains(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
 
 
 def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[float]:

@@ -10,7 +10,7 @@ import torch
 from ghgs_capture.crops import Photograph, crop_to_subject
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.errors import require
-from ghgs_lit.method.rounds.gains import divided
+from ghgs_lit.method.rounds.gains import divide_by_gains
 from ghgs_lit.types import Batch, Cameras
 
 
@@ -70,4 +70,4 @@ class Capture:
         )
         gains = [crop.gains for crop in crops]
         known = all(values is not None for values in gains)
-        return divided(batch, torch.from_numpy(np.log(gains)).float()[None]) if known else batch
+        return divide_by_gains(batch, torch.from_numpy(np.log(gains)).float()[None]) if known else batch

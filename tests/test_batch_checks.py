@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
-from ghgs_lit.execution.checks import findings_of, refuse
+from ghgs_lit.execution.checks import findings_of, raise_violation
 from ghgs_lit.types import Batch
 from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
@@ -96,4 +96,4 @@ def test_checks_of_values_can_be_left_out():
 def test_a_bad_batch_is_refused_by_name(message):
     """Invalid input is rejected with the name of the field."""
     with pytest.raises(InputError, match=message):
-        refuse(findings_of(bad_batches()[message], 14))
+        raise_violation(findings_of(bad_batches()[message], 14))

@@ -19,7 +19,7 @@ from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported
 from ghgs_capture.formats.matrices import camera_entry, cameras_json
 from ghgs_lit.errors import InputError, import_optional, require, require_choice
 from ghgs_lit.geometry.frame import HEIGHT
-from ghgs_lit.geometry.masks import unmultiplied
+from ghgs_lit.geometry.masks import unmultiply
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.ply import ply_bytes
@@ -114,7 +114,7 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
         one that encodes the cameras as JSON.
     """
     for image, matte in zip(subject.images, subject.mattes, strict=True):
-        colors = to_uint8(unmultiplied(image, matte))  # colours in PNG are not premultiplied
+        colors = to_uint8(unmultiply(image, matte))  # colours in PNG are not premultiplied
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
         yield partial(png, np.concatenate([colors, alpha], -1))
     cameras = subject.cameras

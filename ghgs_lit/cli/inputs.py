@@ -18,7 +18,7 @@ from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.precision import half_precision, keep_rounded
-from ghgs_lit.method.model import GHGS, with_known_height
+from ghgs_lit.method.model import GHGS, resolve_height
 from ghgs_lit.method.stages import OPTIONS, STAGES
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
@@ -178,7 +178,7 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
         else:
             _require_same(before, key, value)
     # The height depends on the training of the weights, whose images may have been smaller.
-    return with_known_height(OmegaConf.to_container(after, resolve=True), trained)
+    return resolve_height(OmegaConf.to_container(after, resolve=True), trained)
 
 
 def _check_rounds(checkpoint: str, trained: Any, given: Mapping[str, Any]) -> None:

@@ -14,9 +14,14 @@ from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.extents import extents
-from ghgs_lit.geometry.masks import signed_distance, unmultiplied
+from ghgs_lit.geometry.masks import signed_distance, unmultiply
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
-from ghgs_lit.geometry.rotations import after_motions, motions_between, quaternion_to_matrix, without_common
+from ghgs_lit.geometry.rotations import (
+    apply_motions,
+    motions_between,
+    quaternion_to_matrix,
+    remove_common_motion,
+)
 from ghgs_lit.types import Batch, Cameras
 
 # Stored colours are linear light to the power 1/2.2.
@@ -75,7 +80,7 @@ def change_tones(
     if alpha is None:
         return images**powers
     shares = alpha[:, :, None]
-    return unmultiplied(images, shares) ** powers * shares
+    return unmultiply(images, shares) ** powers * shares
 
 
 def perturb_mask(
@@ -232,12 +237,12 @@ def _remove_common_error(
     """Remove the common part of the errors of cameras; returns float64 intrinsics and extrinsics."""
     true = cameras.extrinsics.double()
     middle = look_at_point(cameras).double()
-    motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
+    motions = remove_common_motion(motions_between(true, pose, middle), true[:, 2, :3])
     both = [0, 1]
     zoom = lens[:, both, both] / cameras.intrinsics.double()[:, both, both]
     lens = lens.clone()
     lens[:, both, both] /= zoom.mean(0)
-    return lens, after_motions(true, motions, middle)
+    return lens, apply_motions(true, motions, middle)
 
 
 #: Minimum and maximum share of a cut subject's height that remains: down to the waist or the ankles.

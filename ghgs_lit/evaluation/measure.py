@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
-from ghgs_lit.method.recalibration.inspection import Call, neighborhoods, seen_calls
+from ghgs_lit.method.recalibration.inspection import Call, collect_calls, neighborhoods
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
@@ -71,7 +71,7 @@ class ModelMethod:
         if self.cameras is not None:
             batch = self.cameras(batch)
         model = getattr(self.predict, "model", None)
-        with seen_calls(getattr(model, "recalibration", None)) as seen:
+        with collect_calls(getattr(model, "recalibration", None)) as seen:
             prediction = self.predict(batch)
         gaussians = prediction.gaussians
         depth = prediction.depth

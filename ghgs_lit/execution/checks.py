@@ -40,7 +40,7 @@ def any_bad(findings: Sequence[Finding]) -> Bool[Tensor, ""]:
     return torch.stack([bad.any() for _, _, bad in findings]).any()
 
 
-def refuse(findings: Sequence[Finding]) -> None:
+def raise_violation(findings: Sequence[Finding]) -> None:
     """Raise an error for the first violated expectation; reads findings with a device-to-host
     synchronisation.
 

@@ -3,7 +3,7 @@
 A host that launches thousands of small kernels is slower than the GPU that runs them. A graph
 launches all of them at once, but repeats exactly the same work: the same sizes, addresses and host
 constants. So a graph is stored under a key of everything that may differ between calls
-(:func:`described`), inputs are copied to the captured addresses, and functions that read a value of
+(:func:`describe_inputs`), inputs are copied to the captured addresses, and functions that read a value of
 the device are rejected."""
 
 import threading
@@ -20,7 +20,7 @@ from torch import Tensor
 from ghgs_lit.execution.capture import CaptureBackend, CaptureChecks, CudaGraphs
 from ghgs_lit.execution.state import ModelState
 from ghgs_lit.geometry.precision import rounding_state
-from ghgs_lit.rendering.capacity import Rooms, deferred
+from ghgs_lit.rendering.capacity import Rooms, defer_checks
 
 Result = TypeVar("Result")
 
@@ -103,16 +103,18 @@ class GraphCache:
             self.reasons.append(reason)
             warnings.warn(f"not captured as a CUDA graph, but called eagerly: {reason}", stacklevel=3)
 
-    def settled(self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()) -> Result:
+    def repeat_until_sufficient(
+        self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()
+    ) -> Result:
         """:meth:`__call__` of a function that renders, repeated until renderings have enough capacity;
         arguments as for :meth:`__call__`."""
 
-        def rendered(inputs: Any) -> tuple[Result, Rooms]:
-            with deferred() as rooms:
+        def render(inputs: Any) -> tuple[Result, Rooms]:
+            with defer_checks() as rooms:
                 return function(inputs), rooms
 
         while True:
-            result, rooms = self(rendered, inputs, key)
+            result, rooms = self(render, inputs, key)
             if rooms.suffice():
                 return result
             # A replay would have the same capacity.
@@ -155,10 +157,10 @@ class GraphCache:
                 else:
                     self.counts["eager"] += 1
                 if graph is not None:
-                    return _replayed(graph, tensors)
+                    return _replay(graph, tensors)
         else:
             self.counts["eager"] += 1
-        return self._called(function, inputs, written)
+        return self._call_eagerly(function, inputs, written)
 
     def _is_due(self, bucket: Hashable) -> bool:
         """Count a call of a bucket, and return whether it had its eager calls before."""
@@ -184,7 +186,7 @@ class GraphCache:
         try:
             # Streams and graphs belong to the current GPU.
             with torch.cuda.device_of(tensors[0]):
-                graph = _captured(self.backend, function, inputs, written)
+                graph = _capture_function(self.backend, function, inputs, written)
         except torch.OutOfMemoryError:
             is_full = True
         except Exception as error:  # drivers fail in many ways
@@ -206,17 +208,19 @@ class GraphCache:
         self._refused.add(bucket)
         self.note(reason)
 
-    def _called(self, function: Callable[[Any], Result], inputs: Any, written: Sequence[Tensor]) -> Result:
+    def _call_eagerly(
+        self, function: Callable[[Any], Result], inputs: Any, written: Sequence[Tensor]
+    ) -> Result:
         """``function(inputs)``, repeated without graphs if memory runs out; not with ``written`` memory,
         since such a call cannot be repeated."""
         if written:
             return function(inputs)
-        return with_memory(lambda: function(inputs))
+        return retry_without_graphs(lambda: function(inputs))
 
     def _bucket(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
         """Key of the graphs that are valid for a call; None if it is not hashable. Appends the tensors of
         ``inputs`` to ``tensors``."""
-        bucket = (key, described(inputs, tensors), _surroundings(self.backend.device))
+        bucket = (key, describe_inputs(inputs, tensors), _torch_state(self.backend.device))
         try:
             hash(bucket)
         except TypeError:
@@ -233,7 +237,7 @@ def free_graphs() -> bool:
     return bool(holders)
 
 
-def with_memory(call: Callable[[], Result]) -> Result:
+def retry_without_graphs(call: Callable[[], Result]) -> Result:
     """Return ``call()``, repeated without graphs if memory runs out."""
     try:
         return call()
@@ -243,7 +247,7 @@ def with_memory(call: Callable[[], Result]) -> Result:
     return call()
 
 
-def described(value: Any, tensors: list[Tensor]) -> Any:
+def describe_inputs(value: Any, tensors: list[Tensor]) -> Any:
     """Describe what a graph requires of ``value``: sizes and types of its tensors, and all other values.
 
     Cached values of dataclasses, which are not fields, are included.
@@ -256,11 +260,11 @@ def described(value: Any, tensors: list[Tensor]) -> Any:
         tensors.append(value)
         return tuple(value.shape), value.dtype, value.device
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value), tuple((name, described(item, tensors)) for name, item in _entries(value))
+        return type(value), tuple((name, describe_inputs(item, tensors)) for name, item in _entries(value))
     if isinstance(value, (tuple, list)):
-        return type(value), tuple(described(item, tensors) for item in value)
+        return type(value), tuple(describe_inputs(item, tensors) for item in value)
     if isinstance(value, dict):
-        return tuple((key, described(item, tensors)) for key, item in value.items())
+        return tuple((key, describe_inputs(item, tensors)) for key, item in value.items())
     return type(value), value
 
 
@@ -271,30 +275,30 @@ def _entries(value: Any) -> Iterator[tuple[str, Any]]:
     yield from ((name, item) for name, item in vars(value).items() if name not in names)
 
 
-def _surroundings(device: str) -> Hashable:
+def _torch_state(device: str) -> Hashable:
     """State of PyTorch that decides which kernels run."""
     autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
     modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
     return autocast, modes, torch.are_deterministic_algorithms_enabled(), rounding_state(device)
 
 
-def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
+def _replace_tensors(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
     """Replace all tensors of ``value``, also in attributes of dataclasses that are not fields."""
     if is_dataclass(value) and not isinstance(value, type):
         names = {field.name for field in fields(value)}
-        entries = {name: _replaced(item, replace) for name, item in _entries(value)}
+        entries = {name: _replace_tensors(item, replace) for name, item in _entries(value)}
         made = type(value)(**{name: item for name, item in entries.items() if name in names})
         vars(made).update(entries)
         return made
     if isinstance(value, (tuple, list)):
-        items = [_replaced(item, replace) for item in value]
+        items = [_replace_tensors(item, replace) for item in value]
         return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
     if isinstance(value, dict):
-        return {key: _replaced(item, replace) for key, item in value.items()}
+        return {key: _replace_tensors(item, replace) for key, item in value.items()}
     return replace(value) if isinstance(value, Tensor) else value
 
 
-def _captured(
+def _capture_function(
     backend: CaptureBackend, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]
 ) -> _Graph:
     """Capture ``function(inputs)`` on copies of the inputs, and restore ``written`` afterwards.
@@ -308,21 +312,21 @@ def _captured(
         places.append(torch.empty_like(tensor).copy_(tensor))
         return places[-1]
 
-    fixed = _replaced(inputs, place)
+    fixed = _replace_tensors(inputs, place)
     checks: list[CaptureChecks] = []
 
-    def checked() -> Any:
+    def call_checked() -> Any:
         # Cached casts of weights would be shared between captured and eager work.
         torch.clear_autocast_cache()
         checks.append(CaptureChecks())
         # A fresh copy: values that the first call caches in dataclasses must be computed by the graph.
-        fresh = _replaced(fixed, lambda tensor: tensor)
+        fresh = _replace_tensors(fixed, lambda tensor: tensor)
         with checks[-1]:
             return function(fresh)
 
     values = [tensor.clone() for tensor in written]
     try:
-        result, replay = backend.capture(checked)
+        result, replay = backend.capture(call_checked)
     finally:
         torch.clear_autocast_cache()  # casts from a failed capture were never computed
         with torch.no_grad():
@@ -330,21 +334,21 @@ def _captured(
     return _Graph(places, result, replay, list(checks[-1].kept.values()))
 
 
-def _replayed(graph: _Graph, tensors: list[Tensor]) -> Any:
-    """Replay a graph with other input tensors (in the order of :func:`described`); returns a copy of the
-    result."""
+def _replay(graph: _Graph, tensors: list[Tensor]) -> Any:
+    """Replay a graph with other input tensors, in the order of :func:`describe_inputs`; returns a copy of
+    the result."""
     _copy_all(graph.inputs, tensors)
     graph.replay()
     results: dict[int, Tensor] = {}
 
-    def noted(tensor: Tensor) -> Tensor:
+    def collect(tensor: Tensor) -> Tensor:
         results[id(tensor)] = tensor
         return tensor
 
-    _replaced(graph.result, noted)
+    _replace_tensors(graph.result, collect)
     copies = {key: torch.empty_like(tensor) for key, tensor in results.items()}
     _copy_all(list(copies.values()), list(results.values()))
-    return _replaced(graph.result, lambda tensor: copies[id(tensor)])
+    return _replace_tensors(graph.result, lambda tensor: copies[id(tensor)])
 
 
 def _copy_all(places: Sequence[Tensor], sources: Sequence[Tensor]) -> None:

@@ -9,8 +9,8 @@ import torch
 
 from ghgs_lit.errors import require_choice
 from ghgs_lit.execution.capture import NotCapturable
-from ghgs_lit.execution.checks import Finding, any_bad, refuse
-from ghgs_lit.execution.graphs import GraphCache, described, with_memory
+from ghgs_lit.execution.checks import Finding, any_bad, raise_violation
+from ghgs_lit.execution.graphs import GraphCache, describe_inputs, retry_without_graphs
 from ghgs_lit.execution.options import ModelOptions
 from ghgs_lit.execution.preprocessing import Preprocessing, preprocess
 from ghgs_lit.execution.scene import Scene
@@ -20,7 +20,7 @@ from ghgs_lit.geometry.precision import PRECISIONS, precision_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan import MaskStatistics, Plan, Sizes
 from ghgs_lit.method.rounds import Coarse, coarse_of, coarse_sizes
-from ghgs_lit.rendering.capacity import settled
+from ghgs_lit.rendering.capacity import repeat_until_sufficient
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
@@ -120,18 +120,18 @@ class Predictor:
         """
         state = self._state(batch)
         inside, done, findings, measured = (
-            self._enter(batch) if state is None else self._captured(batch, state)
+            self._enter(batch) if state is None else self._enter_captured(batch, state)
         )
         plan = self.model.plan(inside, measured, least)
         if plan.flags[1]:
-            refuse(findings)
+            raise_violation(findings)
         return Prepared(inside, plan, done, state)
 
     def finish(self, prepared: Prepared) -> Prediction:
         """Predict from a prepared batch."""
         with precision_of(self.precision, prepared.batch.masks.device):
             prediction = self._predict(prepared, self._coarse(prepared))
-        return prepared.plan.trimmed(prediction)
+        return prepared.plan.trim(prediction)
 
     @property
     def side_multiple(self) -> int:
@@ -162,12 +162,12 @@ class Predictor:
         inside, done, findings = preprocess(batch, self.options, patch_size, self.checks_values)
         return inside, done, findings, self.model.measure(inside, [any_bad(findings)])
 
-    def _captured(
+    def _enter_captured(
         self, batch: Batch, state: ModelState
     ) -> tuple[Batch, Preprocessing, list[Finding], MaskStatistics]:
         """:meth:`_enter`, captured unless a gradient is required."""
         tensors: list[torch.Tensor] = []
-        described(batch, tensors)
+        describe_inputs(batch, tensors)
         if any(tensor.requires_grad for tensor in tensors):
             return self._enter(batch)
         # Fresh cameras: cached values would put the same batch into another bucket the next time.
@@ -190,8 +190,10 @@ class Predictor:
 
         is_eager = state is None or self.model.training or torch.is_grad_enabled()
         if is_eager or not self.fits(batch, plan):
-            return with_memory(partial(settled, partial(predict, batch, plan, coarse, done)))
-        return self.graphs.settled(
+            return retry_without_graphs(
+                partial(repeat_until_sufficient, partial(predict, batch, plan, coarse, done))
+            )
+        return self.graphs.repeat_until_sufficient(
             lambda inputs: predict(*inputs[0].read(), *inputs[1:]),
             (Scene.of(batch, plan), coarse, done),
             (self.precision, state.settings),

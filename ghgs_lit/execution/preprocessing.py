@@ -62,10 +62,10 @@ def preprocess(
     return batch, Preprocessing(dtype, frame, padding), findings
 
 
-def without_targets(batch: Batch) -> Batch:
+def strip_targets(batch: Batch) -> Batch:
     """Copy a batch, padded or not, with only the fields that the stages read, and without cached values."""
     bare = replace(
         batch, cameras=replace(batch.cameras), targets=None, body_vertices=None, subjects=(), views=()
     )
     inner = getattr(batch, "photographs", None)
-    return bare if inner is None else replace(bare, photographs=without_targets(inner))
+    return bare if inner is None else replace(bare, photographs=strip_targets(inner))

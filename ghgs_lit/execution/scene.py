@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool
 from torch import Tensor
 
-from ghgs_lit.execution.preprocessing import without_targets
+from ghgs_lit.execution.preprocessing import strip_targets
 from ghgs_lit.extents import Extent
 from ghgs_lit.method.plan import Plan, Sizes
 from ghgs_lit.method.plan.patches import KeptPatches
@@ -35,11 +35,11 @@ class Scene:
         """Collect the inputs of the stages; fields that only losses read are left out."""
         kept = None if plan.kept.is_whole else plan.kept.mask
         facts = (plan.patch_size, plan.pixels, plan.tokens, plan.sizes, batch.cameras.has_skew)
-        return cls(without_targets(batch), plan.shown, kept, *plan.bucket_extents(), *facts)
+        return cls(strip_targets(batch), plan.shown, kept, *plan.bucket_extents(), *facts)
 
     def read(self) -> tuple[Batch, Plan]:
         """Rebuild the batch and its plan without reading values of tensors."""
-        batch = without_targets(self.batch)
+        batch = strip_targets(self.batch)
         facts = (self.extents, self.shown_extents, self.patch_size, self.pixels, self.tokens, (), self.sizes)
         device = self.shown.device
         if self.kept is None:

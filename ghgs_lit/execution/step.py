@@ -132,7 +132,7 @@ class CapturedStep:
             scale: scalar factor of the loss (``16-mixed``); None: 1.
         """
         predictor = self.predictor
-        with predictor.model.rounds.drawn():
+        with predictor.model.rounds.fix_count():
             prepared = self._prepare(batch)
             is_eager = prepared.state is None or not predictor.fits(prepared.batch, prepared.plan)
             if is_eager or predictor.needs_copies(prepared.batch):
@@ -142,7 +142,7 @@ class CapturedStep:
             targets = dataclasses.replace(batch.targets, names=(), protocols=())
             bodies = batch.body_vertices if self.losses.weights.chamfer else None
             seen = dataclasses.replace(batch, targets=targets, body_vertices=bodies, subjects=(), views=())
-            return self._captured(prepared, seen, scale)
+            return self._capture(prepared, seen, scale)
 
     def _prepare(self, batch: Batch) -> Prepared:
         """Preprocess and plan a batch, with sizes that rarely change."""
@@ -157,19 +157,19 @@ class CapturedStep:
             self.buckets[shape] = self.buckets[view] = prepared.plan.sizes
         return prepared
 
-    def _captured(self, prepared: Prepared, seen: Batch, scale: Tensor | None) -> Outcome:
+    def _capture(self, prepared: Prepared, seen: Batch, scale: Tensor | None) -> Outcome:
         """Compute the loss with gradients from a captured graph; ``seen`` is the original batch."""
         one_pass = _Pass(self.predictor, self.renderer, self.losses)
         weights = {name: weight for name, weight in one_pass.named_parameters() if weight.requires_grad}
 
-        def differentiated(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple]:
+        def compute_gradients(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple]:
             *inputs, scale = inputs
             # Twins: gradients of the weights themselves would be accumulated on another stream.
             twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
             with torch.enable_grad():
                 total, values = functional_call(one_pass, twins, tuple(inputs))
-                gradients = _differentiated(total, list(twins.values()), scale)
-            gradients = tuple(map(_laid_out, gradients, weights.values()))
+                gradients = _differentiate(total, list(twins.values()), scale)
+            gradients = tuple(map(_match_layout, gradients, weights.values()))
             return total.detach(), {name: value.detach() for name, value in values.items()}, gradients
 
         self.graphs.of_weights(prepared.state)
@@ -181,7 +181,7 @@ class CapturedStep:
             tuple(weights),
         )
         with torch.no_grad():
-            total, values, gradients = self.graphs.settled(differentiated, inputs, key)
+            total, values, gradients = self.graphs.repeat_until_sufficient(compute_gradients, inputs, key)
         used = [pair for pair in zip(weights.values(), gradients, strict=True) if pair[1] is not None]
         known = _Known.apply(total, [gradient for _, gradient in used], *[weight for weight, _ in used])
         return Outcome(known, values, sum(prepared.plan.counts))
@@ -201,7 +201,7 @@ def _plain(sizes: Sizes) -> tuple:
     return *rows, tuple(map(tuple, window))
 
 
-def _differentiated(total: Tensor, weights: Sequence[Tensor], scale: Tensor | None) -> list[Tensor | None]:
+def _differentiate(total: Tensor, weights: Sequence[Tensor], scale: Tensor | None) -> list[Tensor | None]:
     """Gradients of a loss for each weight, None for unused ones; computed on ``scale * total`` and divided
     by ``scale``, against underflow in float16."""
     with torch.autocast(total.device.type, enabled=False):
@@ -215,7 +215,7 @@ def _differentiated(total: Tensor, weights: Sequence[Tensor], scale: Tensor | No
         return gradients
 
 
-def _laid_out(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
+def _match_layout(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
     """Convert a gradient to the layout of its weight; otherwise PyTorch would copy each separately."""
     if gradient is None or gradient.stride() == weight.stride():
         return gradient

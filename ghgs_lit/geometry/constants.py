@@ -21,20 +21,20 @@ def constant(
         like: gives the device, and the dtype if ``dtype`` is None.
         dtype: of the result.
     """
-    make_once = _made if like.device.type == "cpu" else _kept
+    make_once = _make if like.device.type == "cpu" else _kept
     return make_once(make, sizes, dtype or like.dtype, like.device)
 
 
 @lru_cache(maxsize=128)
 @torch.inference_mode(False)  # a later use may need gradients
-def _made(make: Callable[..., Tensor], sizes: tuple, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _make(make: Callable[..., Tensor], sizes: tuple, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Compute a constant on the CPU and copy it to its device."""
     # A tensor made from a list directly on a GPU synchronises device and host.
     return make(*sizes, dtype=dtype, device="cpu").to(device, non_blocking=True)
 
 
 #: Without a limit: captured CUDA graphs read the memory of constants at every replay.
-_kept = cache(_made.__wrapped__)
+_kept = cache(_make.__wrapped__)
 
 
 def middles(count: int, **kind: object) -> Tensor:

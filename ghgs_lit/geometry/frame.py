@@ -109,7 +109,7 @@ class Frame:
         everyone = constant(torch.arange, len(self.metre), like=points.pixels, dtype=torch.long)
         known: dict[Tensor, Tensor] = {}
         metre = self.metre.to(prediction.depth)[:, None, None, None]
-        maps = _in_unit(prediction.depth_maps, metre, known)
+        maps = _scale_maps(prediction.depth_maps, metre, known)
         world = self.in_world(dtype)
         return dataclasses.replace(
             prediction,
@@ -121,7 +121,7 @@ class Frame:
                 tokens=to_world(points.tokens, points.token_image // views, world),
             ),
             depth_maps=maps,
-            rounds=tuple(_in_unit(each_round, metre, known) for each_round in prediction.rounds),
+            rounds=tuple(_scale_maps(each_round, metre, known) for each_round in prediction.rounds),
             drafts=tuple(self._gaussians(draft, views, world) for draft in prediction.drafts),
         )
 
@@ -138,16 +138,16 @@ class Frame:
         )
 
 
-def _in_unit(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tensor, Tensor]) -> DepthMaps:
+def _scale_maps(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tensor, Tensor]) -> DepthMaps:
     """Scale depth maps to the world's unit; ``known`` caches results, since rounds share bounds."""
 
-    def scaled(depth: Tensor) -> Tensor:
+    def scale(depth: Tensor) -> Tensor:
         if depth not in known:
             known[depth] = depth * metre
         return known[depth]
 
-    bounds = maps.bounds and DepthBounds(scaled(maps.bounds.near), scaled(maps.bounds.far))
-    return dataclasses.replace(maps, depth=scaled(maps.depth), bounds=bounds)
+    bounds = maps.bounds and DepthBounds(scale(maps.bounds.near), scale(maps.bounds.far))
+    return dataclasses.replace(maps, depth=scale(maps.depth), bounds=bounds)
 
 
 def to_world(

@@ -44,7 +44,7 @@ def patches_around_subject(
     Returns:
         True for selected patches [b, v, h, w].
     """
-    return _grown(F.max_pool2d(masks.float(), patch_size), margin)
+    return _grow(F.max_pool2d(masks.float(), patch_size), margin)
 
 
 def patches_in_window(
@@ -63,7 +63,7 @@ def patches_in_window(
     touched = F.max_pool2d(masks.float(), patch_size).bool()
     rows = between(touched.any(-1))
     columns = between(touched.any(-2))
-    return _grown((rows[..., :, None] & columns[..., None, :]).float(), margin)
+    return _grow((rows[..., :, None] & columns[..., None, :]).float(), margin)
 
 
 def between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
@@ -73,7 +73,7 @@ def between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
     return (index >= first[..., None]) & (index <= last[..., None])
 
 
-def _grown(patches: Float[Tensor, "b v h w"], margin: int) -> Bool[Tensor, "b v h w"]:
+def _grow(patches: Float[Tensor, "b v h w"], margin: int) -> Bool[Tensor, "b v h w"]:
     return F.max_pool2d(patches, 2 * margin + 1, 1, margin).bool()
 
 
@@ -133,10 +133,10 @@ def coverage(batch: Batch) -> Float[Tensor, "B V H W"]:
 def surface_colors(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
     """Colours of the subject's surface: input images divided by the matte, at most 1."""
     images = at_least_float32(batch.images)
-    return images if batch.alpha is None else unmultiplied(images, batch.alpha.to(images.dtype)[:, :, None])
+    return images if batch.alpha is None else unmultiply(images, batch.alpha.to(images.dtype)[:, :, None])
 
 
-def unmultiplied(images: Tensor, alpha: Tensor) -> Tensor:
+def unmultiply(images: Tensor, alpha: Tensor) -> Tensor:
     """Divide premultiplied colours by ``alpha``: at most 1, unchanged where ``alpha`` is 0.
 
     Args:

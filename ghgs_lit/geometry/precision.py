@@ -55,7 +55,7 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     """
     require_choice("precision", name, PRECISIONS)
     if name == "inherit":
-        return _inherited() if device.type == "cuda" else nullcontext()
+        return _inherit() if device.type == "cuda" else nullcontext()
     if name == "bfloat16":
         require(has_bfloat16(device), "precision", "float32 on a device without bfloat16", name)
     if name in ("tf32", "float16"):
@@ -95,7 +95,7 @@ def exact(device: str) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _inherited() -> Iterator[None]:
+def _inherit() -> Iterator[None]:
     """The caller's precision on CUDA, with TF32 products if PyTorch's default is active.
 
     That default uses TF32 in convolutions but not in products: slower, and no more accurate overall."""
@@ -103,7 +103,7 @@ def _inherited() -> Iterator[None]:
     if not before.is_default:
         yield
         return
-    _say_rounding()
+    _warn_rounding()
     round_products(True, "cuda")
     try:
         yield
@@ -112,7 +112,7 @@ def _inherited() -> Iterator[None]:
 
 
 @cache
-def _say_rounding() -> None:
+def _warn_rounding() -> None:
     warnings.warn(
         "precision=inherit: factors of products are rounded to TF32 (11 bits), as PyTorch does in "
         "convolutions on a GPU; precision=float32 rounds neither",

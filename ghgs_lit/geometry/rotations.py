@@ -66,13 +66,15 @@ def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
         ``(w, x, y, z)`` [..., 4].
     """
     numbers = F.pad(matrices.flatten(-2), (1, 0), value=1.0)
-    table = _signed(numbers, _TABLE, _TABLE_SIGNS).sum(-1).unflatten(-1, (4, 4))
+    table = _gather_signed(numbers, _TABLE, _TABLE_SIGNS).sum(-1).unflatten(-1, (4, 4))
     best = table.diagonal(dim1=-2, dim2=-1).argmax(-1)
     chosen = table.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
     return chosen / chosen.norm(dim=-1, keepdim=True)
 
 
-def _signed(numbers: Float[Tensor, "*batch n"], places: tuple, signs: tuple) -> Float[Tensor, "*batch r 4"]:
+def _gather_signed(
+    numbers: Float[Tensor, "*batch n"], places: tuple, signs: tuple
+) -> Float[Tensor, "*batch r 4"]:
     """Gather the numbers at ``places`` (rows of four) and multiply them by ``signs``."""
     index = constant(torch.tensor, sum(places, ()), like=numbers, dtype=torch.long)
     chosen = numbers.index_select(-1, index).unflatten(-1, (-1, 4))
@@ -102,7 +104,7 @@ def multiply_quaternions(
 
     Quaternions are ``(w, x, y, z)`` of any norm; norms multiply.
     """
-    return (first[..., None, :] * _signed(second, _FACTORS, _FACTOR_SIGNS)).sum(-1).flip(-1)
+    return (first[..., None, :] * _gather_signed(second, _FACTORS, _FACTOR_SIGNS)).sum(-1).flip(-1)
 
 
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
@@ -136,7 +138,7 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
 _ALONG = 0.01
 
 
-def without_common(
+def remove_common_motion(
     motions: Float[Tensor, "*b V 6"], axes: Float[Tensor, "*b V 3"]
 ) -> Float[Tensor, "*b V 6"]:
     """Remove the motion common to all cameras: the mean, and the mean shift along optical axes.
@@ -182,7 +184,7 @@ def motions_between(
     before: Float[Tensor, "V 4 4"], after: Float[Tensor, "V 4 4"], middle: Float[Tensor, "3"]
 ) -> Float[Tensor, "V 6"]:
     """Small motions of the world about ``middle`` that are equivalent to replacing the extrinsics
-    ``before`` by ``after``; the inverse of :func:`after_motions`.
+    ``before`` by ``after``; the inverse of :func:`apply_motions`.
 
     Args:
         before: extrinsics [V, 4, 4].
@@ -201,7 +203,7 @@ def motions_between(
     return torch.cat((vector, (back @ seen[..., None])[..., 0]), -1)
 
 
-def after_motions(
+def apply_motions(
     extrinsics: Float[Tensor, "*n 4 4"],
     motions: Float[Tensor, "*n 6"],
     middle: Float[Tensor, "3"],

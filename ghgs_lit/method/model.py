@@ -148,7 +148,7 @@ class GHGS(nn.Module):
             InputError: a stage is missing, an option is unknown or out of range, or stages are
                 incompatible.
         """
-        config = with_known_height(config, config)
+        config = resolve_height(config, config)
         skip = read_node(config.get("skip") or {}, "skip")
         parts: dict[str, Any] = {}
         with torch.device("meta") if empty else nullcontext():
@@ -173,7 +173,7 @@ class GHGS(nn.Module):
         return model
 
 
-def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
+def resolve_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
     """Replace ``rounds.height: auto`` in a model's nodes by a number of pixels; null if sizes are unknown.
 
     Args:

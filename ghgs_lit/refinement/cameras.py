@@ -19,7 +19,7 @@ from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32, project
-from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
+from ghgs_lit.geometry.rotations import apply_motions, remove_common_motion, rigid
 from ghgs_lit.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
@@ -87,22 +87,22 @@ class CameraRefinement:
         """Correct the input cameras of a batch of two or more views; targets are unchanged, and so are
         the cameras of elements that do not improve."""
         frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
-        inside, moved, free, first = self._coherent(frame.enter(batch))
+        inside, moved, free, first = self._make_coherent(frame.enter(batch))
         for _ in range(self.rounds):
             with torch.no_grad():
                 prediction = self.predict(inside)
             worth = torch.where(moved, _LATER, first)
-            cameras, is_better = self._corrected(prediction, inside, free, worth)
+            cameras, is_better = self._correct(prediction, inside, free, worth)
             if not bool(is_better.any()):
                 break
             inside = replace(inside, cameras=cameras)
             moved = moved | is_better
         # A round trip through the frame is not exact: unmoved cameras are copied.
         left = frame.leave_cameras(inside.cameras, batch.cameras)
-        return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
+        return replace(batch, cameras=_choose(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()
-    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
+    def _make_coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
         """Make silhouettes consistent, where a prediction confirms the gain.
 
         Args:
@@ -116,18 +116,18 @@ class CameraRefinement:
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
-        is_better = self._confirmed(batch, cameras)
+        is_better = self._confirm(batch, cameras)
         shared = ~is_better & ~free.all(1)
         if bool(shared.any()):  # the few suspected cameras were not confirmed: move all of them
             together, _, _ = coherent_cameras(batch, self.shared, alone=False)
-            cameras = _chosen(shared[:, None], together, cameras)
+            cameras = _choose(shared[:, None], together, cameras)
             free = free | shared[:, None]
-            is_better = torch.where(shared, self._confirmed(batch, cameras), is_better)
+            is_better = torch.where(shared, self._confirm(batch, cameras), is_better)
         free = free | ~is_better[:, None]
-        cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
+        cameras = _choose(is_better[:, None] & free, cameras, batch.cameras)
         return replace(batch, cameras=cameras), is_better, free, first
 
-    def _confirmed(self, batch: Batch, cameras: Cameras) -> Bool[Tensor, " B"]:
+    def _confirm(self, batch: Batch, cameras: Cameras) -> Bool[Tensor, " B"]:
         """Which elements' predictions agree better with ``cameras``; False where these are unchanged."""
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
@@ -153,7 +153,7 @@ class CameraRefinement:
         loss = errors / torch.where(subject > 0, subject, 1)
         return loss.mean().expand(len(loss)) if self.shared else loss
 
-    def _corrected(
+    def _correct(
         self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
         """Optimise the free cameras in one round.
@@ -178,8 +178,8 @@ class CameraRefinement:
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
         for _ in range(_STEPS):
             with exact(axes.device.type), torch.enable_grad():
-                motion = _of_free(raw.expand(len(axes), -1, -1), axes, free)
-                drawn = self.renderer(_moved(views, motion), views.cameras, background=0.0)
+                motion = _restrict_to_free(raw.expand(len(axes), -1, -1), axes, free)
+                drawn = self.renderer(_move_gaussians(views, motion), views.cameras, background=0.0)
                 losses.append(self._loss(drawn, views, batch))
                 optimizer.zero_grad()
                 (losses[-1].sum() + _STAY * motion.square().sum()).backward()
@@ -187,19 +187,19 @@ class CameraRefinement:
             schedule.step()
         is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
         with exact(axes.device.type):
-            motion = _of_free(raw.detach().expand(len(axes), -1, -1), axes, free)
-            extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
+            motion = _restrict_to_free(raw.detach().expand(len(axes), -1, -1), axes, free)
+            extrinsics = apply_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
         corrected = replace(cameras, extrinsics=extrinsics)
-        return _chosen(is_better[:, None] & free, corrected, cameras), is_better
+        return _choose(is_better[:, None] & free, corrected, cameras), is_better
 
 
-def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
+def _restrict_to_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
     """Set motions of fixed cameras to 0; where all are free, remove the common motion."""
     all_are = free.all(1)[:, None, None]
-    return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
+    return torch.where(all_are, remove_common_motion(motions, axes), motions * free[..., None])
 
 
-def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
+def _choose(which: Which, first: Cameras, second: Cameras) -> Cameras:
     """Take each camera from ``first`` where ``which`` (broadcast to [B, V]) is True, else from
     ``second``."""
     which = which[..., None, None]
@@ -247,7 +247,7 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
     return _Views(others, owner, apart, *(each.flatten(0, 1) for each in maps))
 
 
-def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
+def _move_gaussians(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
     """Move the Gaussians of each view instead of its camera; their orientations stay."""
     rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts

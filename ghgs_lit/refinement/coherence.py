@@ -20,7 +20,7 @@ from torch import Tensor
 from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.precision import exact
-from ghgs_lit.geometry.rotations import after_motions, without_common
+from ghgs_lit.geometry.rotations import apply_motions, remove_common_motion
 from ghgs_lit.refinement.outlines import QUICK, TO, Lens, Outlines, Pose, best_points, gradients_of, rows_of
 from ghgs_lit.types import Batch, Cameras
 
@@ -82,13 +82,13 @@ class _Alignment:
     free: Which
     distances: tuple[float, ...] = ()
 
-    def after(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
+    def advance(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
         aligned = self
         for _ in range(phase.steps):
             equations = silhouettes.equations(aligned.lens, aligned.pose, phase)
-            steps = equations.solved(self.free)
+            steps = equations.solve(self.free)
             are_all = bool(self.free.all())
-            moved = _stepped(steps, aligned.lens, aligned.pose, are_all)
+            moved = _apply_step(steps, aligned.lens, aligned.pose, are_all)
             aligned = _Alignment(*moved, self.free, (*aligned.distances, equations.distance))
         return aligned
 
@@ -160,7 +160,7 @@ def coherent_cameras(
     middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
     each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
     with exact("cpu"):
-        rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part], alone) for part in each]
+        rigs = [_align(mattes[part], lens[part], pose[part][0], middle[part], alone) for part in each]
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count = len(pose) // len(rigs)
     device = batch.masks.device
@@ -171,7 +171,7 @@ def coherent_cameras(
     return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
 
 
-def _coherent(
+def _align(
     mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles, alone: bool
 ) -> tuple[Lenses, Pose, Which, float]:
     """:func:`coherent_cameras` of one rig.
@@ -195,15 +195,15 @@ def _coherent(
     if given.distance < _COHERENT:
         return lens, pose, every, given.distance
     start = _Alignment(lens, pose, every)
-    aligned = start.after(_MEET, silhouettes)
+    aligned = start.advance(_MEET, silhouettes)
     few = _minority(silhouettes, lens, pose) if alone and given.distance > _BUMPED else None
     if few is not None:
-        apart = _Alignment(lens, pose, few).after(_MEET, silhouettes)
+        apart = _Alignment(lens, pose, few).advance(_MEET, silhouettes)
         # Two of three views nearly always agree.
         rest = 0.1 * _COHERENT if len(pose) == 3 else max(_COHERENT, _REST * given.distance)
         enough = max(_AS_WELL * aligned.distances[-1], rest)
         aligned = apart if apart.distances[-1] < enough else aligned
-    aligned = aligned.after(_LIE, silhouettes)
+    aligned = aligned.advance(_LIE, silhouettes)
     return aligned.lens, aligned.pose, aligned.free, given.distance
 
 
@@ -235,7 +235,7 @@ class _Equations:
         sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
         return _Equations(*sums)
 
-    def solved(self, free: Which) -> Float[Tensor, "V 7"]:
+    def solve(self, free: Which) -> Float[Tensor, "V 7"]:
         """Solve for the step of the free cameras; 0 for the others."""
         index = free.repeat_interleave(7).nonzero()[:, 0]
         steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
@@ -256,7 +256,7 @@ class _Silhouettes:
         rays = 0
         for outlines, each, middle in zip(self.outlines, lens, self.middle, strict=True):
             some = outlines.of_views(kept)
-            placed = _placed(pose[kept], middle)
+            placed = _center_poses(pose[kept], middle)
             depth = best_points(some, each[kept], placed, some.view, some.pixels)[2]
             missed = missed - float(depth.clamp(max=0).sum())
             rays = rays + len(depth)
@@ -287,7 +287,7 @@ def _equations(
         about a pixel.
     """
     count = len(pose)
-    pose = _placed(pose, middle)
+    pose = _center_poses(pose, middle)
     near = outlines.depth <= phase.to
     view = outlines.view[near]
     depth_at_home = outlines.depth[near]
@@ -306,9 +306,9 @@ def _equations(
     return _Equations(normal, -(weighted.mT @ distances), len(distances), float(distances.abs().sum()))
 
 
-def _placed(pose: Pose, middle: Float[Tensor, " 3"]) -> Pose:
+def _center_poses(pose: Pose, middle: Float[Tensor, " 3"]) -> Pose:
     """Shift poses to the subject's centre, around which rays are searched."""
-    return after_motions(pose, F.pad(middle, (3, 0)).expand(len(pose), 6), pose.new_zeros(3))
+    return apply_motions(pose, F.pad(middle, (3, 0)).expand(len(pose), 6), pose.new_zeros(3))
 
 
 def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
@@ -316,13 +316,13 @@ def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
     return HEIGHT / 2 * (lens[..., 0, 0] / pose[:, 2, 3]).mean()
 
 
-def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
+def _apply_step(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
     """Apply motions and zooms ``steps`` (in units of about a pixel) to intrinsics and extrinsics; with
     ``are_all``, all cameras are free, and the common motion and zoom are removed."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
     if are_all:
-        motions = without_common(motions, pose[:, 2, :3])
+        motions = remove_common_motion(motions, pose[:, 2, :3])
         zooms = zooms - zooms.mean(0)
     zoomed = lens.clone()
     zoomed[..., [0, 1], [0, 1]] *= zooms.exp()
-    return zoomed, after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
+    return zoomed, apply_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)

@@ -85,7 +85,7 @@ class Descent:
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
         """The current Gaussians, without a gradient."""
-        return self._changed()
+        return self._apply_changes()
 
     def step(self, renderer: Renderer, seen: Seen, weights: Weights = WEIGHTS) -> Rendering:
         """Take one optimiser step, and return the renders before it.
@@ -96,13 +96,13 @@ class Descent:
             weights: weights of L1, 1 - SSIM and L1 of the silhouette.
         """
         with exact(self.start.means.device.type), torch.enable_grad():
-            drawn = renderer(self._changed(), seen[2], background=0.0)
+            drawn = renderer(self._apply_changes(), seen[2], background=0.0)
             self._optimizer.zero_grad()
             _loss(drawn, *seen[:2], weights).backward()
             self._optimizer.step()
         return drawn
 
-    def _changed(self) -> Gaussians:
+    def _apply_changes(self) -> Gaussians:
         start = self.start
         change = {n: c.limit * torch.tanh(self._raw[n] / c.limit) for n, c in self.changes.items()}
         changed = {name: getattr(start, name) + value for name, value in change.items()}

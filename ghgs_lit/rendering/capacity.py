@@ -2,8 +2,9 @@
 
 Reading the number of intersections would synchronise device and host before anything is rendered. So
 each rendering gets the capacity that similar ones needed, with a margin; the number that it really
-needed is read later: while the GPU renders, or after several renderings (:func:`settled`). If the
-capacity was too small, the rendering is repeated with enough: an image never lacks splats."""
+needed is read later: while the GPU renders, or after several renderings
+(:func:`repeat_until_sufficient`). If the capacity was too small, the rendering is repeated with enough:
+an image never lacks splats."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -74,7 +75,7 @@ _rooms: ContextVar[Rooms | None] = ContextVar("rooms", default=None)
 
 
 @contextmanager
-def deferred() -> Iterator[Rooms]:
+def defer_checks() -> Iterator[Rooms]:
     """Context in which renderings do not check their capacities: the caller must check
     :meth:`Rooms.suffice`."""
     rooms = Rooms()
@@ -85,26 +86,26 @@ def deferred() -> Iterator[Rooms]:
         _rooms.reset(token)
 
 
-def settled(call: Callable[[], T]) -> T:
+def repeat_until_sufficient(call: Callable[[], T]) -> T:
     """Return ``call()``, repeated until every rendering inside had enough capacity.
 
     Takes one device-to-host synchronisation per call, none without renderings. A repeated call has
     the capacity that the last one needed.
 
     Args:
-        call: renders, any number of times, and may be called repeatedly. Inside :func:`deferred` it
+        call: renders, any number of times, and may be called repeatedly. Inside :func:`defer_checks` it
             is called once and not checked.
     """
     if _rooms.get() is not None:
         return call()
     while True:
-        with deferred() as rooms:
+        with defer_checks() as rooms:
             result = call()
         if rooms.suffice():
             return result
 
 
-def with_room(
+def render_with_capacity(
     grid: Grid,
     splats: int,
     find: Callable[[int], tuple[T, Tensor]],
@@ -119,7 +120,7 @@ def with_room(
         draw: renders intersections.
 
     Returns:
-        The last result of ``draw``. Inside :func:`deferred` it may lack splats: the caller checks
+        The last result of ``draw``. Inside :func:`defer_checks` it may lack splats: the caller checks
         the capacities.
     """
     rooms = _rooms.get()

@@ -14,7 +14,7 @@ from torch import Tensor
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.ops.intersections import TILE, Intersections, intersections
 from ghgs_lit.ops.rasterization.settings import RasterSettings
-from ghgs_lit.rendering.capacity import with_room
+from ghgs_lit.rendering.capacity import render_with_capacity
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: The limit of alpha that is compiled into gsplat.
@@ -96,17 +96,17 @@ def rasterize(
         nothing = (gaussians.means.sum() + gaussians.colors.sum()).float()
         drawn = nothing * nothing.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
     else:
-        drawn = _drawn(gsplat, gaussians, cameras, settings, near, far)
+        drawn = _render(gsplat, gaussians, cameras, settings, near, far)
     image, depth, alpha = drawn.split((channels, 1, 1), dim=2)
     return Rendering(image=image, alpha=alpha, depth=depth)
 
 
-def _drawn(
+def _render(
     gsplat: Any, gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Tensor:
     """Render colours, expected depth and alpha [B, T, C + 2, h, w] of at least one Gaussian and one
     camera."""
-    fields = _sanitized(*_side_by_side(gaussians))
+    fields = _sanitize(*_pad_elements(gaussians))
     means, quaternions, scales, opacities, colors = fields
     if settings.alpha_max < _ALPHA_MAX:
         # Opacities above the limit keep their gradient,
@@ -126,7 +126,7 @@ def _drawn(
         "eps2d": settings.low_pass,
     }
     if _is_known(gsplat) and colors.shape[-1] < _CHANNELS:
-        values, alpha = _without_wait(gsplat, seen, colors, settings.antialiased)
+        values, alpha = _render_without_sync(gsplat, seen, colors, settings.antialiased)
     else:
         mode = "antialiased" if settings.antialiased else "classic"
         options = {"render_mode": "RGB+ED", "packed": False, "rasterize_mode": mode}
@@ -148,7 +148,7 @@ def _is_known(gsplat: Any) -> bool:
     return known
 
 
-def _without_wait(
+def _render_without_sync(
     gsplat: Any, seen: dict[str, Any], colors: Tensor, antialiased: bool
 ) -> tuple[Tensor, Tensor]:
     """gsplat's ``rasterization`` without its device-to-host synchronisation.
@@ -178,16 +178,16 @@ def _without_wait(
 
     draw = partial(gsplat.rasterize_to_pixels, centers, conics, colors, opacities, width, height, TILE)
 
-    def drawn(listed: Intersections) -> tuple[Tensor, Tensor]:
+    def draw_listed(listed: Intersections) -> tuple[Tensor, Tensor]:
         return draw(listed.offsets, listed.splats, masks=listed.has_pixels)
 
     grid = (-(-height // TILE), -(-width // TILE))
-    values, alpha = with_room(grid, depths.numel(), find, drawn)
+    values, alpha = render_with_capacity(grid, depths.numel(), find, draw_listed)
     depth = values[..., -1:] / alpha.clamp(min=1e-10)
     return torch.cat((values[..., :-1], depth), -1), alpha
 
 
-def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
+def _pad_elements(gaussians: Gaussians) -> tuple[Tensor, ...]:
     """Pad Gaussians to [B, N, ...] in float32 with ones of opacity 0, to at least :data:`_WARP` if
     there are several elements; returns means, quaternions, scales, opacities and colours."""
     names = ("means", "quaternions", "scales", "opacities", "colors")
@@ -202,7 +202,7 @@ def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
     return means, quaternions, scales, opacities[..., 0], colors
 
 
-def _sanitized(
+def _sanitize(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> tuple[Tensor, ...]:
     """Replace values that gsplat would treat unlike the other backends.

@@ -14,7 +14,7 @@ from rich.table import Column
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
+from ghgs_lit.method.recalibration.inspection import collect_calls, neighborhoods
 from ghgs_lit.runs.progress import Lines, format_duration, on_terminal
 
 
@@ -87,7 +87,7 @@ class NeighborsAtStart(Callback):
         """Start recording calls of the recalibration."""
         self._stack = ExitStack()
         stage = getattr(pl_module.model, "recalibration", None)
-        self._seen = self._stack.enter_context(seen_calls(stage))
+        self._seen = self._stack.enter_context(collect_calls(stage))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         """Print the numbers after the first step."""

@@ -47,7 +47,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
         Raises:
             InputError: the file is not a checkpoint, or its frozen weights are missing."""
-        content = frozen.joined(path, open_file(path))
+        content = frozen.join_frozen(path, open_file(path))
         content["pytorch-lightning_version"] = L.__version__  # supported versions need no migration
         return content
 

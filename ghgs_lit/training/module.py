@@ -16,9 +16,9 @@ from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.execution.step import CapturedStep, Outcome
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.losses import Losses
-from ghgs_lit.method.heads.inspection import offsets_at_limit, seen_attributes
+from ghgs_lit.method.heads.inspection import collect_attributes, offsets_at_limit
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.method.plan.presets import KeptTokens, seeing
+from ghgs_lit.method.plan.presets import KeptTokens, keep_patches
 from ghgs_lit.method.rounds import Rounds
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.training.base import BudgetedModule, image_mean
@@ -54,7 +54,7 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
 
     Args:
         budget: see :func:`sample_budget`; None: as the model is configured."""
-    return nullcontext() if budget is None else seeing(model.encoder, KeptTokens.of_budget(budget))
+    return nullcontext() if budget is None else keep_patches(model.encoder, KeptTokens.of_budget(budget))
 
 
 def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[None]:
@@ -62,7 +62,7 @@ def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[N
 
     Args:
         count: number of rounds; None: each prediction samples one."""
-    return nullcontext() if count is None else model.rounds.drawn(count)
+    return nullcontext() if count is None else model.rounds.fix_count(count)
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -211,7 +211,7 @@ class GHGSModule(BudgetedModule):
         Returns:
             ``prediction`` and ``rendering``, for callbacks."""
         head = getattr(self.model, "gaussian_head", None)
-        with seen_attributes(head) as seen:
+        with collect_attributes(head) as seen:
             prediction, rendering = self(batch)
         size = len(batch.images)
         for name, values in self._measure(rendering.image, batch.targets, VALIDATED).items():

@@ -13,9 +13,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
-from ghgs_lit.method.recalibration.inspection import Call, attention_of, seen_calls
+from ghgs_lit.method.recalibration.inspection import Call, attention_of, collect_calls
 from ghgs_lit.types import Batch, Prediction
-from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.attention import attention_sheet, choose_token
 from ghgs_lit.visualization.pictures import clouds, save_png, sheet
 
 #: TensorBoard's view of point clouds: points of two centimetres in a perspective camera.
@@ -57,7 +57,7 @@ class Pictures(Callback):
         """Start recording calls of the recalibration for the first batch."""
         self._number = 0
         stage = getattr(pl_module.model, "recalibration", None)
-        self._calls = self._stack.enter_context(seen_calls(stage if self.options.subjects else None))
+        self._calls = self._stack.enter_context(collect_calls(stage if self.options.subjects else None))
 
     def on_validation_batch_end(
         self,
@@ -91,7 +91,7 @@ class Pictures(Callback):
     def _show_attention(self, trainer: L.Trainer, batch: Batch, call: Call, name: str) -> None:
         """Log the attention of the chosen token of the first subject."""
         _, tokens, points = call
-        token = chosen_token(tokens, points, 0, self.options.token)
+        token = choose_token(tokens, points, 0, self.options.token)
         attention = None if token is None else attention_of(*call, token)
         if attention is not None:
             padding = pad_to_patches(batch.masks, tokens.patch_size)

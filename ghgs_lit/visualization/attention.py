@@ -14,7 +14,7 @@ _SIDE = 224  # minimum height of a tile in pixels
 _QUERY = (255, 60, 220)
 
 
-def chosen_token(
+def choose_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
     """Index of the packed token with a valid point nearest to ``at``; None if its view has none.

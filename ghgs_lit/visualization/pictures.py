@@ -211,14 +211,14 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
     if batch.body_vertices is not None:
         body = batch.body_vertices[element]
         parts["body"] = (body, body.new_tensor(BODY_COLOR).expand(len(body), 3))
-    parts = {name: _thinned(cloud, limit) for name, cloud in parts.items()}
+    parts = {name: _thin(cloud, limit) for name, cloud in parts.items()}
     if "body" in parts:
         pairs = zip(parts["points"], parts["body"], strict=True)
         parts["points_and_body"] = tuple(torch.cat(pair) for pair in pairs)
     return {name: cloud for name, cloud in parts.items() if len(cloud[0])}
 
 
-def _thinned(cloud: Cloud, limit: int) -> Cloud:
+def _thin(cloud: Cloud, limit: int) -> Cloud:
     positions, colors = (part.detach().float().cpu() for part in cloud)
     finite = positions.isfinite().all(-1)
     positions = positions[finite]

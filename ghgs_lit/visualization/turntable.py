@@ -104,11 +104,11 @@ def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cam
     extrinsics[:, :3, 3] = -(rotation @ positions[..., None])[..., 0]
     intrinsics = cameras.intrinsics[:1].expand(frames, 3, 3)
     if points is not None and frames:
-        intrinsics = _fitted(intrinsics, extrinsics, points, cameras.height, cameras.width)
+        intrinsics = _fit_lens(intrinsics, extrinsics, points, cameras.height, cameras.width)
     return Cameras(intrinsics, extrinsics.to(cameras.extrinsics.dtype), cameras.height, cameras.width)
 
 
-def _fitted(intrinsics: Tensor, extrinsics: Tensor, points: Tensor, height: int, width: int) -> Tensor:
+def _fit_lens(intrinsics: Tensor, extrinsics: Tensor, points: Tensor, height: int, width: int) -> Tensor:
     """Centre the principal point, and shorten focal lengths until all points are in the frame."""
     middle = intrinsics.new_tensor([width / 2, height / 2])
     intrinsics = intrinsics.clone()

@@ -13,7 +13,7 @@ from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolve_path, write_atomically
 from ghgs_lit.geometry.precision import fast_precision
-from ghgs_lit.weights.frozen import SHARING, joined
+from ghgs_lit.weights.frozen import SHARING, join_frozen
 from ghgs_lit.weights.reading import open_file, require_dense
 
 FORMAT_VERSION = 2  #: Version of self-contained checkpoints; version 1 is read too
@@ -49,7 +49,7 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     if not 1 <= version <= SHARING:
         newer = ", of a newer version of this package" if version > SHARING else ""
         raise InputError(f"{path}: expected format_version 1 to {SHARING}; found {version}{newer}")
-    checkpoint = joined(path, checkpoint, whole)
+    checkpoint = join_frozen(path, checkpoint, whole)
     _check_content(path, checkpoint)
     return checkpoint
 

@@ -77,7 +77,7 @@ def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
     write_atomically(path, partial(torch.save, dict(tensors)))
 
 
-def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
+def join_frozen(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
     """Add the tensors of its shared file, if any, to the content of a checkpoint.
 
     Args:

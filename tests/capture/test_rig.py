@@ -174,7 +174,7 @@ def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, ask
     next_one = CaptureFolder(tmp_path / "images" / "1", path)
     capture = Capture("next", next_one.photographs(*next_one.instants))
     # what an instant would guess with
-    monkeypatch.setattr("ghgs_lit.method.rounds.rounds.equalized", None)
+    monkeypatch.setattr("ghgs_lit.method.rounds.rounds.equalize", None)
     result = predict(capture, model, (112, 112), refine_cameras=0, refine_masks=0)
     plain = given[1].batch((112, 112))
     np.testing.assert_allclose(result.batch.log_gains[0].exp(), found, rtol=1e-6)

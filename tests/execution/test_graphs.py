@@ -142,7 +142,7 @@ def test_rounding_of_products_is_another_bucket():
     kinds = []
     for name in ("usual", "rounding"):
         with other_bucket(name)["around"]:
-            kinds.append(graphs._surroundings("cuda"))
+            kinds.append(graphs._torch_state("cuda"))
     assert kinds[0] != kinds[1]
 
 

@@ -131,9 +131,9 @@ def test_gradients_of_float16_do_not_underflow():
     """2^-26 is 0 in float16, but its multiple is not."""
     weight = torch.ones(4, requires_grad=True)
     total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
-    assert step._differentiated(total, [weight], None)[0].abs().max() == 0
+    assert step._differentiate(total, [weight], None)[0].abs().max() == 0
     total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
-    (slope,) = step._differentiated(total, [weight], torch.tensor(2.0**10))
+    (slope,) = step._differentiate(total, [weight], torch.tensor(2.0**10))
     assert torch.equal(slope, torch.full((4,), 2.0**-26))
 
 
@@ -223,7 +223,7 @@ def test_numbers_of_rounds_are_sampled_once_and_are_a_bucket_each():
     model, batch = training("model=recurrent"), scene()
     captured = capturing(model)
     for count in (1, 1, 2, 1):
-        with model.rounds.drawn(count):
+        with model.rounds.fix_count(count):
             captured(batch)
     assert dict(captured.graphs.counts) == {"eager": 2, "captured": 1, "replayed": 1}
 

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import (
-    _say_rounding,
+    _warn_rounding,
     exact,
     keep_rounded,
     precision_of,
@@ -101,7 +101,7 @@ def test_float32_is_exact_and_tf32_is_refused_on_a_cpu():
 def test_products_round_where_convolutions_do_which_is_said_once():
     """With PyTorch's default on CUDA, TF32 in convolutions alone, products use TF32 too, with one
     warning; the state is restored."""
-    _say_rounding.cache_clear()
+    _warn_rounding.cache_clear()
     before = state()
     with pytest.warns(UserWarning, match="precision=inherit: factors of products are rounded to TF32"):
         _entered("inherit")

@@ -8,15 +8,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.geometry.rotations import (
-    after_motions,
+    apply_motions,
     matrix_to_quaternion,
     motions_between,
     multiply_quaternions,
     quaternion_to_matrix,
+    remove_common_motion,
     rigid,
     rotate,
     unit,
-    without_common,
 )
 from tests.helpers.scenes import ring
 
@@ -80,8 +80,8 @@ def test_what_cameras_share_is_taken_out_and_the_rest_stays():
     axes = torch.nn.functional.normalize(torch.randn(2, 4, 3, generator=g), dim=-1)
     motions = torch.randn(2, 4, 6, generator=g)
     shared = torch.randn(2, 1, 6, generator=g).expand(-1, 4, -1).clone()
-    apart = without_common(motions, axes)
-    torch.testing.assert_close(without_common(motions + shared, axes), apart, rtol=0, atol=1e-5)
+    apart = remove_common_motion(motions, axes)
+    torch.testing.assert_close(remove_common_motion(motions + shared, axes), apart, rtol=0, atol=1e-5)
     assert (apart[..., :3].mean(1)).abs().max() < 1e-6
     assert (apart[..., 3:] * axes).sum(-1).mean(1).abs().max() < 1e-6
     turns = motions[..., :3] - motions[..., :3].mean(1, keepdim=True)
@@ -95,10 +95,10 @@ def test_what_cameras_share_is_what_photographs_show():
     motions = torch.zeros(4, 6)
     motions[:, 3] = torch.tensor([0.1, 0.0, -0.1, 0.0])
     # The two motions are opposite and have no common part.
-    torch.testing.assert_close(without_common(motions, axes), motions)
+    torch.testing.assert_close(remove_common_motion(motions, axes), motions)
     along = motions.clone()
     along[1, 3] = 1.0
-    across = without_common(along, axes)[[0, 2], 3] - motions[[0, 2], 3]
+    across = remove_common_motion(along, axes)[[0, 2], 3] - motions[[0, 2], 3]
     assert across.abs().max() < 0.01
 
 
@@ -115,7 +115,7 @@ def test_cameras_that_moved_tell_their_motions():
     before = ring(1, 4, 42, 42).extrinsics[0].double()
     before[:, :3, 3] -= before[:, :3, :3] @ middle
     motions = 1e-3 * torch.randn(4, 6, generator=torch.Generator().manual_seed(1)).double()
-    after = after_motions(before, motions, middle)
+    after = apply_motions(before, motions, middle)
     found = motions_between(before, after, middle)
     torch.testing.assert_close(found, motions, rtol=1e-5, atol=1e-9)
     point = middle + 0.3

@@ -147,7 +147,7 @@ def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch, 
         asked.append(worth)
         return batch.cameras, torch.zeros(2, dtype=torch.bool)
 
-    monkeypatch.setattr(CameraRefinement, "_corrected", corrected)
+    monkeypatch.setattr(CameraRefinement, "_correct", corrected)
     CameraRefinement(1, predictor(truth), RENDERER)(batch)
     assert asked[0].min() > 0
     assert bool(asked[0][0] > 2 * asked[0][1]) == (views == 4)

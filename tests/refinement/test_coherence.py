@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.projection import project, unproject_maps
-from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
+from ghgs_lit.geometry.rotations import apply_motions, remove_common_motion, rigid
 from ghgs_lit.refinement import coherence
 from ghgs_lit.refinement.coherence import coherent_cameras, contradiction, culprit
 from ghgs_lit.refinement.outlines import Outlines, best_points, gradients_of, rows_of
@@ -193,8 +193,8 @@ def test_a_step_follows_the_motion_that_took_cameras_away(monkeypatch):
     pose = truth.cameras.extrinsics[0]
     motion = torch.zeros(4, 6)
     motion[2, 3:] = 6 * pose[2, 2, 3] / truth.cameras.intrinsics[0, 2, 0, 0] / (HEIGHT / 2) * pose[2, 0, :3]
-    motion = without_common(motion, pose[:, 2, :3])
-    moved = after_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
+    motion = remove_common_motion(motion, pose[:, 2, :3])
+    moved = apply_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
     monkeypatch.setattr(coherence, "_minority", lambda *_: None)
     found, _, _ = coherent_cameras(wrong)

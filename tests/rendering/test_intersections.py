@@ -7,7 +7,7 @@ import torch
 from ghgs_lit.extents import bucket_size
 from ghgs_lit.ops.intersections import TILE, intersections
 from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
-from ghgs_lit.rendering.capacity import deferred, settled
+from ghgs_lit.rendering.capacity import defer_checks, repeat_until_sufficient
 from tests.helpers.gsplat import InParts, functions
 from tests.helpers.kernels import DEVICE as KERNELS
 from tests.helpers.kernels import kernels
@@ -126,20 +126,20 @@ def test_several_renderings_are_settled_together(capacities):
         calls.append(None)
         return drawn(), drawn()
 
-    for found, wanted in settled(call):
+    for found, wanted in repeat_until_sufficient(call):
         torch.testing.assert_close(found.image, wanted.image, rtol=1e-3, atol=1e-4)
     assert len(calls) == 2
-    settled(call)
+    repeat_until_sufficient(call)
     assert len(calls) == 3
 
 
 def test_too_little_room_is_seen_also_when_played_back(capacities):
     """On replay with other values, the needed numbers are updated in place."""
-    with deferred() as rooms:
+    with defer_checks() as rooms:
         drawn(size=0.01)
     assert rooms.suffice()
     rooms.rooms[0].needed.fill_(rooms.rooms[0].capacity + 1)
     assert not rooms.suffice()
-    with deferred() as rooms:
+    with defer_checks() as rooms:
         pass
     assert rooms.suffice()

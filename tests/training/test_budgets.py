@@ -108,8 +108,8 @@ def test_a_class_of_steps_has_one_budget_and_one_number_of_rounds(tmp_path):
     assert len({step.seed for step in steps}) == 2
     assert steps[0].rounds == steps[1].rounds in model.rounds.options.training_counts
     with number_of_rounds(model, 3):
-        model.rounds._drawn = None
-        with model.rounds.drawn():
+        model.rounds._sample_count = None
+        with model.rounds.fix_count():
             assert model.rounds._known_count == 3
     assert model.rounds._known_count is None
 

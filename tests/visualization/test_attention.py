@@ -9,7 +9,7 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.recalibration.inspection import attention_of
-from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.attention import attention_sheet, choose_token
 from ghgs_lit.visualization.pictures import clouds
 from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
@@ -45,7 +45,7 @@ def test_the_weights_are_those_of_the_forward(overrides):
     model, batch = make_model("skip=none", *overrides).eval(), make_batch(2, 3)
     (tokens, points), output, _ = seen(model, batch)
     block = model.recalibration.block
-    for query in [chosen_token(tokens, points, element) for element in range(2)]:
+    for query in [choose_token(tokens, points, element) for element in range(2)]:
         attention = attention_of(model.recalibration, tokens, points, query)
         assert torch.allclose(attention.weights.sum(-1), torch.ones(()), atol=1e-5)
         used, block.similarity = block.similarity, "none"
@@ -66,14 +66,14 @@ def test_the_chosen_token_is_of_its_element_and_has_a_point():
     model, batch = make_model("skip=none").eval(), make_batch(2, 3)
     (tokens, points), _, _ = seen(model, batch)
     for element in range(2):
-        query = chosen_token(tokens, points, element)
+        query = choose_token(tokens, points, element)
         assert int(tokens.image[query]) == element * 3
         assert points.tokens_valid[query]
     # no token there: the nearest one with a point
-    query = chosen_token(tokens, points, 1, (2, 0, 0))
+    query = choose_token(tokens, points, 1, (2, 0, 0))
     assert int(tokens.image[query]) == 5
     with pytest.raises(InputError, match=r"callbacks\.pictures\.token"):
-        chosen_token(tokens, points, 0, (3, 0, 0))
+        choose_token(tokens, points, 0, (3, 0, 0))
     background = int((~points.tokens_valid).nonzero()[0])
     assert attention_of(model.recalibration, tokens, points, background) is None
 
@@ -83,7 +83,7 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
     """Coloured patches are at the rows and columns of the neighbours."""
     model, batch = make_model(f"skip={skip}").eval(), make_batch(1, 3, height=56, width=70, zoom=0.5)
     (tokens, points), _, _ = seen(model, batch)
-    attention = attention_of(model.recalibration, tokens, points, chosen_token(tokens, points, 0))
+    attention = attention_of(model.recalibration, tokens, points, choose_token(tokens, points, 0))
     dark = dataclasses.replace(batch, images=torch.zeros_like(batch.images))
     picture = attention_sheet(dark, tokens, attention)
     scale, gap = 4, 2

@@ -74,7 +74,7 @@ class SubjectBox(Options):
         """
         with exact(batch.masks.device.type):
             coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, self.dilation)
-            voting = self._voting(coarse)
+            voting = self._select_voting(coarse)
             lower, upper = subject_box(
                 coarse.masks & voting[..., None, None],
                 coarse.cameras,
@@ -84,7 +84,7 @@ class SubjectBox(Options):
             )
             return self._within(batch, coarse, voting, lower - MARGIN, upper + MARGIN)
 
-    def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
+    def _select_voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
         """Select the views that vote about the box, using even coarser masks."""
         few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation, coarse.cut)
         center = subject_center(few.masks, few.cameras)
@@ -97,9 +97,9 @@ class SubjectBox(Options):
     ) -> DepthBounds:
         """Compute bounds of all pixels within the subject's box, from corner ``lower`` to ``upper`` [B, 3]
         in metres; ``coarse`` are the masks at a lower resolution, ``voting`` the views to use."""
-        return self._valid(depths_in_box(batch.cameras, lower, upper))
+        return self._make_valid(depths_in_box(batch.cameras, lower, upper))
 
-    def _valid(self, bounds: DepthBounds) -> DepthBounds:
+    def _make_valid(self, bounds: DepthBounds) -> DepthBounds:
         """Clamp bounds in front of the camera, and move them apart where they are too close."""
         near, far = (x.nan_to_num(nan=0.0).clamp(max=_FARTHEST) for x in (bounds.near, bounds.far))
         missing = (MIN_THICKNESS - (far - near)).clamp(min=0) / 2

@@ -37,8 +37,8 @@ class VisualHull(SubjectBox):
     ) -> DepthBounds:
         """As in :class:`SubjectBox`, but within the hull for the subject's pixels; rays are marched at the
         resolution of ``coarse``."""
-        box = self._valid(depths_in_box(batch.cameras, lower, upper))
-        start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
+        box = self._make_valid(depths_in_box(batch.cameras, lower, upper))
+        start = box if coarse.stride == 1 else self._make_valid(depths_in_box(coarse.cameras, lower, upper))
         # At least one cell: the rays of a cell's pixels differ from the ray of its centre.
         radius = max(coarse.dilation, 1)
         rays = batch.pixels if coarse.stride == 1 else None
@@ -46,7 +46,7 @@ class VisualHull(SubjectBox):
         seen = (coarse.masks, coarse.cameras, start, radius)
         hull = hull_bounds(*seen, self.tolerance, self.samples, rays, voting, count, coarse.cut)
         near, far = (_enlarge(x, coarse.stride, batch.masks.shape[-2:]) for x in (hull.near, hull.far))
-        return self._valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
+        return self._make_valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
 
 
 def hull_bounds(

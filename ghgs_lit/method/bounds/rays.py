@@ -147,10 +147,10 @@ def dilate(
         radius: radius in pixels.
         more: additional radius of each element; None: 0.
     """
-    return _grown(_grown(masks, radius, more, -2), radius, more, -1)
+    return _dilate_axis(_dilate_axis(masks, radius, more, -2), radius, more, -1)
 
 
-def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
+def _dilate_axis(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
     """:func:`dilate` along one axis (-2 or -1), at a cost independent of the radius."""
     if more is not None:
         radius = radius + more.view(-1, *[1] * (masks.dim() - 1))

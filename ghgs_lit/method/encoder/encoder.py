@@ -273,8 +273,8 @@ class VGGTEncoder(nn.Module):
         plan = make_plan(masks, self.patch_size, self.keeps(masks)) if plan is None else plan
         kept = plan.kept
         with bfloat16_where_possible(images.device) if self.precision == "bfloat16" else nullcontext():
-            pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
-        latent = tuple(_joined(pairs, kept, self.aggregator.special))
+            pairs, patches = self.aggregator(self._normalize(images, masks, bounds), kept)
+        latent = tuple(_join_pairs(pairs, kept, self.aggregator.special))
         semantic = patches.detach() if self.semantic is None else self.semantic(images, masks, plan)
         places = (kept.image, kept.row, kept.column)
         return Tokens(latent, semantic, *places, kept.grid, self.patch_size, kept.real)
@@ -288,7 +288,7 @@ class VGGTEncoder(nn.Module):
         grid = (b, v, height // self.patch_size, width // self.patch_size)
         return torch.ones(grid, dtype=torch.bool, device="cpu")
 
-    def _normalized(self, images: Tensor, masks: Tensor, bounds: DepthBounds | None) -> Tensor:
+    def _normalize(self, images: Tensor, masks: Tensor, bounds: DepthBounds | None) -> Tensor:
         x = at_least_float32(images)
         if self.mask_input:
             x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
@@ -298,7 +298,7 @@ class VGGTEncoder(nn.Module):
         return x.to(self.aggregator.camera_token.dtype)
 
 
-def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Float[Tensor, "N C"]]:
+def _join_pairs(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Float[Tensor, "N C"]]:
     """Concatenate the patch tokens of both blocks of each layer (C = 2 c); empties ``pairs`` to free
     memory."""
     while pairs:

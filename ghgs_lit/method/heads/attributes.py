@@ -63,7 +63,7 @@ class RawGaussians:
     splits: tuple[int, ...]
     real: Bool[Tensor, " N"] | None = None
 
-    def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
+    def add_change(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
         """Add a change of offset, scale, rotation, opacity and color (:data:`RAW_VALUES` channels)."""
         offset, scale, rotation, opacity, color = change.split(_WIDTHS, -1)
         return dataclasses.replace(

@@ -132,7 +132,7 @@ class DepthHead(nn.Module):
         windows = plan.depth_windows
         p = plan.patch_size
         wanted = None if windows is None else plan.shown.repeat_interleave(p, -2).repeat_interleave(p, -1)
-        value, confidence = _whole(decode(self.dpt, tokens, guide, windows, plan.together), batch, wanted)
+        value, confidence = _paste(decode(self.dpt, tokens, guide, windows, plan.together), batch, wanted)
         if self.is_bounded:
             depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.options.parameterization)
         else:
@@ -153,7 +153,7 @@ def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBo
     return DepthMaps(torch.where(finite, depth, 1.0), batch.masks & finite, confidence, bounds)
 
 
-def _whole(
+def _paste(
     parts: Iterable[Part], batch: Batch, wanted: Bool[Tensor, "B V H W"] | None
 ) -> Float[Tensor, "o B V H W"]:
     """Paste decoded windows into maps of whole images, float32 or wider; 0 outside ``wanted``.

@@ -305,7 +305,7 @@ class DPTHead(nn.Module):
         """Compute the window ``result`` of the output from the map ``x`` in ``windows.fused``, before the
         last interpolation; ``guide`` covers ``windows.full``."""
         layers = self.scratch.output_conv2
-        seen = result.grown(reach(layers))
+        seen = result.grow(reach(layers))
         x = add_positions_(windows.fused.resize(x, seen), aspect, seen)
         if guide is not None:
             x = x + windows.full.cut(guide, seen)
@@ -333,20 +333,20 @@ class DPTHead(nn.Module):
             grid: rows and columns of patches.
         """
         s = self.scratch
-        full = result.grown(reach(s.output_conv2))
-        fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))
+        full = result.grow(reach(s.output_conv2))
+        fused = full.sources(_times(2 * CELLS[0], grid)).grow(reach(s.output_conv1))
         target = fused
         levels = []
         for i, resize in enumerate(self.resize_layers):
             fusion = getattr(s, f"refinenet{i + 1}")
             size = _times(CELLS[i], grid) if i < len(CELLS) else tuple(-(-n // 2) for n in grid)
-            joined = target.sources(size).grown(reach(fusion.resConfUnit2))
-            level = joined.grown(reach(getattr(s, f"layer{i + 1}_rn"), fusion) - reach(fusion.resConfUnit2))
+            joined = target.sources(size).grow(reach(fusion.resConfUnit2))
+            level = joined.grow(reach(getattr(s, f"layer{i + 1}_rn"), fusion) - reach(fusion.resConfUnit2))
             if i < len(CELLS):
                 tokens = level.coarser(CELLS[i])
                 level = tokens.finer(CELLS[i], size)
             else:
-                level = level.grown(reach(resize))
+                level = level.grow(reach(resize))
                 tokens = level.finer(2, grid)
             levels.append(LevelWindows(tokens, level, joined))
             target = joined

@@ -61,7 +61,7 @@ class GuidePyramid(nn.Module):
         needed = [target.sources(n) for target, n in zip(targets, sizes, strict=True)]
         seen = functools.reduce(
             Window.hull,
-            (window.grown(1).finer(factor, size) for window, factor in zip(needed, (1, 2, 4), strict=True)),
+            (window.grow(1).finer(factor, size) for window, factor in zip(needed, (1, 2, 4), strict=True)),
         )
         seen = seen.coarser(4).finer(4, size)
         parts = [part[..., *seen.slices].permute(0, 2, 3, 1) for part in guide]

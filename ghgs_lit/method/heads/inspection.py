@@ -17,7 +17,7 @@ NEAR_LIMIT = 0.95
 
 
 @contextmanager
-def seen_attributes(head: nn.Module | None) -> Iterator[list[RawGaussians]]:
+def collect_attributes(head: nn.Module | None) -> Iterator[list[RawGaussians]]:
     """Collect the raw attributes that a head activates within the context, in the order of calls.
 
     The last ones are those of the prediction: rounds change them, and downsampled images pass through

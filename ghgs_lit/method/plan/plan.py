@@ -107,7 +107,7 @@ class Plan:
         """Number of the subject's pixels in each element."""
         return _of_elements(self.extents, self.views)
 
-    def trimmed(self, prediction: Prediction) -> Prediction:
+    def trim(self, prediction: Prediction) -> Prediction:
         """Remove Gaussians (also of the rounds' drafts) that pad a shape bucket.
 
         On a GPU, Gaussians of pixels with a depth that is not finite remain, with opacity 0."""
@@ -282,13 +282,13 @@ def _bucket(
     window = functools.reduce(Window.hull, seen) if seen else Window(*(Span(0, 1, full) for full in grid))
     if least is not None:
         both = least.window.hull(window)
-        window = both if both == least.window else both.grown(1)
+        window = both if both == least.window else both.grow(1)
     return Sizes(
         rows("pixels", _of_elements(extents, views), views * size[0] * size[1]),
         rows("peers", peers, views * patches),
         of_image,
         rows("shown", [extent.count for extent in shown], patches),
-        Window(*(span.widened() for span in window)),
+        Window(*(span.widen() for span in window)),
     )
 
 

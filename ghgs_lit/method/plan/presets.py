@@ -25,7 +25,7 @@ class KeptTokens(NamedTuple):
 
 
 @contextmanager
-def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
+def keep_patches(encoder: Any, view: KeptTokens) -> Iterator[None]:
     """Context in which an encoder keeps other patches.
 
     Args:

@@ -21,7 +21,7 @@ class Span(NamedTuple):
     stop: int
     full: int
 
-    def grown(self, cells: int) -> "Span":
+    def grow(self, cells: int) -> "Span":
         """The span enlarged by ``cells`` on each side, clipped to the map."""
         return Span(max(self.start - cells, 0), min(self.stop + cells, self.full), self.full)
 
@@ -38,7 +38,7 @@ class Span(NamedTuple):
         """Cells of these blocks of ``factor`` cells; the last block may be smaller."""
         return Span(self.start * factor, min(self.stop * factor, full), full)
 
-    def widened(self) -> "Span":
+    def widen(self) -> "Span":
         """The span enlarged to a length of :func:`ghgs_lit.extents.bucket_size`, within the map."""
         length = min(bucket_size(self.stop - self.start), self.full)
         start = min(self.start, self.full - length)
@@ -75,9 +75,9 @@ class Window(NamedTuple):
         """Rows and columns as slices, to index maps."""
         return slice(*self.rows[:2]), slice(*self.columns[:2])
 
-    def grown(self, cells: int) -> "Window":
-        """Apply :meth:`Span.grown` along both axes; the next four methods do likewise."""
-        return Window(*(span.grown(cells) for span in self))
+    def grow(self, cells: int) -> "Window":
+        """Apply :meth:`Span.grow` along both axes; the next four methods do likewise."""
+        return Window(*(span.grow(cells) for span in self))
 
     def sources(self, full: tuple[int, int]) -> "Window":
         return Window(*(span.sources(n) for span, n in zip(self, full, strict=True)))

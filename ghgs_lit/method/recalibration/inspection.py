@@ -97,7 +97,7 @@ Call = tuple[Recalibration, Tokens, Points]
 
 
 @contextmanager
-def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
+def collect_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
     """Collect the inputs of the stage's calls within the context, appended to the yielded list.
 
     Nothing is computed, so measured run times are unaffected.

@@ -142,14 +142,14 @@ class SemanticAttention(nn.Module):
         k, v = in_parts(keys_values, len(x), most).chunk(2, dim=-1)
         if places is not None:
             places = places.to(v.dtype)
-            v = self._with_places(v, places)
+            v = self._append_places(v, places)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             q = at_least_float32(self.q_proj(self.norm1(x[rows])))
             changes = (None if values is None else values[rows] for values in (factor, bias))
             y = attend_to_neighbors(q, k, v, near[rows], self.num_heads, *changes)
             if places is not None:
-                y = self._moved(y, places[rows])
+                y = self._add_positions(y, places[rows])
             residual = x[rows] + self.o_proj(y)
             return residual + self.mlp(self.norm2(residual))
 
@@ -167,12 +167,12 @@ class SemanticAttention(nn.Module):
             return None, cosines.clamp(min=S_MIN).log()
         return cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines, None
 
-    def _with_places(self, v: Float[Tensor, "n i"], places: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
+    def _append_places(self, v: Float[Tensor, "n i"], places: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
         """Append the token's position to the channels of each head's values, j = i + 3 a."""
         heads = v.unflatten(1, (self.num_heads, -1))
         return torch.cat((heads, places[:, None].expand(-1, self.num_heads, -1)), dim=-1).flatten(1)
 
-    def _moved(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
+    def _add_positions(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
         """Replace the mean positions in weighted values by their contribution, relative to the queries'."""
         values, mean = y.unflatten(1, (self.num_heads, -1)).tensor_split([-3], dim=-1)
         weight = self.place_proj.weight.to(y.dtype).unflatten(0, (self.num_heads, -1))

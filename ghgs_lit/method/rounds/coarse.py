@@ -106,14 +106,14 @@ class Coarse:
     def encoder(self, encoder: Callable[..., Tokens]) -> Callable[..., Tokens]:
         """Wrap an encoder: elements with a copy use its tokens; ``encoder`` is called only if there are
         others."""
-        return functools.partial(self._encoded, encoder)
+        return functools.partial(self._encode, encoder)
 
     def depth_head(self, head: Callable[..., DepthMaps]) -> Callable[..., DepthMaps]:
         """Wrap a depth head: elements with a copy use its depths; ``head`` is called only if there are
         others."""
-        return functools.partial(self._decoded, head)
+        return functools.partial(self._decode, head)
 
-    def _decoded(
+    def _decode(
         self,
         head: Callable[..., DepthMaps],
         tokens: Tokens,
@@ -124,7 +124,7 @@ class Coarse:
         others = None if self.depths.are_all else head(tokens, batch, bounds, plan)
         return self.depths.maps(batch, bounds, others)
 
-    def _encoded(
+    def _encode(
         self,
         encoder: Callable[..., Tokens],
         images: Tensor,
@@ -175,9 +175,9 @@ def coarse_of(
     for size in wanted:
         numbers = tuple(i for i, own in enumerate(sizes) if own == size)
         chosen = constant(torch.tensor, numbers, like=depths, dtype=torch.long)
-        prediction = predict(shrunk(_elements(photographs, chosen), size, least_matte))
+        prediction = predict(shrink(_elements(photographs, chosen), size, least_matte))
         maps = prediction.depth_maps
-        grown = torch.stack((enlarged(maps, full), _resized(maps.confidence, full)))
+        grown = torch.stack((enlarge(maps, full), _resize(maps.confidence, full)))
         depths = depths.index_copy(1, chosen, grown.to(depths.dtype))
         spread = spread_tokens(prediction.tokens, batch, patch_size)
         rows = spread.new_zeros(len(sizes), *spread.shape[1:]) if rows is None else rows
@@ -185,7 +185,7 @@ def coarse_of(
     if isinstance(batch, PaddedBatch):
         depths = torch.stack([batch.padding.pad(each) for each in depths])
     of_elements = tuple(size is not None for size in sizes)
-    return Coarse(CoarseDepths(*depths, of_elements), _packed(rows, prediction.tokens))
+    return Coarse(CoarseDepths(*depths, of_elements), _pack(rows, prediction.tokens))
 
 
 def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:
@@ -242,7 +242,7 @@ def spread_tokens(tokens: Tokens, batch: Batch, patch_size: int) -> Float[Tensor
     return values.permute(0, 2, 3, 1).unflatten(0, tokens.grid[:2])
 
 
-def _packed(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
+def _pack(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
     """Build tokens of every patch from concatenated layers and semantic features, with the widths and
     dtypes of ``like``."""
     grid = tuple(rows.shape[:4])
@@ -255,15 +255,15 @@ def _packed(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
     return Tokens(tuple(latent), semantic, image, row, number % grid[3], grid, like.patch_size)
 
 
-def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
+def shrink(batch: Batch, size: Size, least_matte: float | None) -> Batch:
     """Downsample images, mattes, masks and cameras of a batch; true depths and targets are dropped.
 
     Args:
         batch: images without padding.
         size: height and width of the copies, in pixels.
         least_matte: matte above which a pixel belongs to the subject, for batches with mattes."""
-    images = _resized(at_least_float32(batch.images).flatten(0, 1), size).unflatten(0, batch.masks.shape[:2])
-    shares = _resized(coverage(batch), size).clamp(0, 1)
+    images = _resize(at_least_float32(batch.images).flatten(0, 1), size).unflatten(0, batch.masks.shape[:2])
+    shares = _resize(coverage(batch), size).clamp(0, 1)
     has_matte = batch.alpha is not None
     return dataclasses.replace(
         batch,
@@ -276,7 +276,7 @@ def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
     )
 
 
-def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
+def enlarge(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
     """Resample depths in metres to another size; 0 where no valid depth is near.
 
     Inverse depths are interpolated, which is exact for planes.
@@ -290,12 +290,12 @@ def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
     # Extend depths by one pixel: a finger may lie in the full-size mask but not in the copy's.
     weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
     inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
-    weight = _resized((weight > 0).to(depth.dtype), size)
-    inverse = _resized(inverse, size)
+    weight = _resize((weight > 0).to(depth.dtype), size)
+    inverse = _resize(inverse, size)
     return torch.where(inverse > 0, weight / torch.where(inverse > 0, inverse, 1), 0)
 
 
-def _resized(maps: Float[Tensor, "B c H W"], size: Size) -> Float[Tensor, "B c h w"]:
+def _resize(maps: Float[Tensor, "B c H W"], size: Size) -> Float[Tensor, "B c h w"]:
     return F.interpolate(maps, size, mode="bilinear", antialias=True)
 
 

@@ -14,7 +14,7 @@ from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.method.rounds.observation import looked_up
+from ghgs_lit.method.rounds.observation import sample_maps
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Gaussians
 
@@ -40,7 +40,7 @@ _STEPS_OF_SLOPES = 15
 Real = Bool[Tensor, " N"] | None
 
 
-def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
+def equalize(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
     """Estimate the gains of the cameras, and divide Gaussians' colours and input images by them.
 
     Args:
@@ -53,10 +53,10 @@ def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Ga
     """
     logs = log_gains(gaussians, batch, real)
     colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
-    return dataclasses.replace(gaussians, colors=colors), divided(batch, logs)
+    return dataclasses.replace(gaussians, colors=colors), divide_by_gains(batch, logs)
 
 
-def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
+def divide_by_gains(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
     """Divide images by gains, and clamp them to [0, 1].
 
     Args:
@@ -81,15 +81,15 @@ def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Te
         real: which rows are Gaussians; None: all.
     """
     with exact(gaussians.means.device.type):
-        own, logs, theirs, weights = _compared(gaussians, batch, real)
+        own, logs, theirs, weights = _compare_colors(gaussians, batch, real)
         ratios = logs - theirs
         b, views = batch.masks.shape[:2]
         gains = ratios.new_zeros(b, views, 3)
         for _ in range(_STEPS):
             between = (gains[:, None] - gains[:, :, None]).flatten(0, 1)[own]
             counted = weights / (1 + ((ratios - between) / _OUTLIER).square())
-            sums = _summed(own, b * views, counted, counted * ratios)
-            gains = _solved(*sums.view(2, b, views, views, 3))
+            sums = _sum_by_image(own, b * views, counted, counted * ratios)
+            gains = _solve(*sums.view(2, b, views, views, 3))
         return gains * gains.square() / (gains.square() + _LEAST**2)
 
 
@@ -107,30 +107,32 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
         batch: the input views.
     """
     with exact(gaussians.means.device.type):
-        own, logs, theirs, weights = _compared(gaussians, batch)
+        own, logs, theirs, weights = _compare_colors(gaussians, batch)
         ratios = logs - theirs
         levels = (logs + theirs) / 2
         b, views = batch.masks.shape[:2]
         fitted = torch.zeros_like(ratios)
         for _ in range(_STEPS_OF_SLOPES):
             counted = weights / (1 + ((ratios - fitted) / _OUTLIER).square())
-            total, *sums = _summed(own, b * views, counted, counted * ratios, counted * levels)
+            total, *sums = _sum_by_image(own, b * views, counted, counted * ratios, counted * levels)
             ratio, level = (each / total.clamp(min=_PRIOR) for each in sums)
             away = levels - level[own]
-            moments = _summed(own, b * views, counted * away.square(), counted * away * ratios)
-            gammas = _solved(*moments.view(2, b, views, views, 3), _PRIOR_OF_SLOPES)
+            moments = _sum_by_image(own, b * views, counted * away.square(), counted * away * ratios)
+            gammas = _solve(*moments.view(2, b, views, views, 3), _PRIOR_OF_SLOPES)
             between = (gammas[:, None] - gammas[:, :, None]).flatten(0, 1)[own]
             fitted = ratio[own] + between * away
         return gammas - gammas.quantile(0.5, 1, keepdim=True)
 
 
-def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]) -> Float[Tensor, "k I V 3"]:
+def _sum_by_image(
+    own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]
+) -> Float[Tensor, "k I V 3"]:
     """Sum each of k values over the Gaussians of each of I images; ``own`` is each Gaussian's image."""
     stacked = torch.stack(values)
     return stacked.new_zeros(len(values), images, *stacked.shape[2:]).index_add_(1, own, stacked)
 
 
-def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
+def _thin(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
     """Select every :data:`_EVERY`-th Gaussian of each element; returns them and their indices."""
     device = gaussians.means.device
     splits = gaussians.splits
@@ -140,7 +142,7 @@ def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
     return gaussians.select(index, tuple(map(len, kept))), index
 
 
-def _compared(
+def _compare_colors(
     gaussians: Gaussians, batch: Batch, real: Real = None
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
     """Sample the colours of some Gaussians in all views.
@@ -149,10 +151,10 @@ def _compared(
     0 where it is not visible."""
     depth = render(gaussians, batch.cameras).depth
     views = batch.masks.shape[1]
-    gaussians, index = _thinned(gaussians)
+    gaussians, index = _thin(gaussians)
     shares = coverage(batch)[:, :, None]
     maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2).to(batch.cameras.extrinsics)
-    values, z, can_see = looked_up(gaussians, batch.cameras, maps)
+    values, z, can_see = sample_maps(gaussians, batch.cameras, maps)
     color, share, depth = values.split((3, 1, 1), -1)
     color = color / torch.where(share > 0, share, 1)
     near = _NEAR if gaussians.metre is None else _NEAR * gaussians.metre[gaussians.image // views, None, None]
@@ -166,7 +168,7 @@ def _compared(
     return gaussians.image, logs, logs.gather(1, own), weights * weights.gather(1, own)
 
 
-def _solved(
+def _solve(
     counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"], prior: float = _PRIOR
 ) -> Float[Tensor, "B V 3"]:
     """Least-squares logs of each view from differences between pairs of views.

@@ -88,7 +88,7 @@ def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = No
         return observations(*seen, at_least_float32(batch.images), *maps, _BEHIND, gaussians.splits)
 
 
-def looked_up(
+def sample_maps(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
     """Sample maps bilinearly at projected means; 0 beyond the border.

@@ -24,7 +24,7 @@ from ghgs_lit.method.bounds.rays import ray_directions
 from ghgs_lit.method.heads.attributes import RAW_VALUES, RawGaussians
 from ghgs_lit.method.heads.gaussian import float32_last
 from ghgs_lit.method.rounds.exchange import Exchange, Windows
-from ghgs_lit.method.rounds.gains import equalized
+from ghgs_lit.method.rounds.gains import equalize
 from ghgs_lit.method.rounds.observation import SLOPES, observe, slopes
 from ghgs_lit.ops.activation import bounded_tanh
 from ghgs_lit.ops.linear import Linear
@@ -63,7 +63,7 @@ class State:
     points: Points
     depth_maps: DepthMaps
 
-    def activated(self, activate: "Activate", batch: Batch) -> "State":
+    def activate_with(self, activate: "Activate", batch: Batch) -> "State":
         """Compute the Gaussians of the raw attributes."""
         gaussians = activate(self.raw, batch, self.points, self.depth_maps)
         return dataclasses.replace(self, gaussians=gaussians)
@@ -132,9 +132,9 @@ class NoRounds(nn.Module):
 
     def forward(self, state: State, activate: Activate, batch: Batch, step: float = 1.0) -> tuple[State, ...]:
         """The only state, with its Gaussians; arguments as for :meth:`Rounds.forward`."""
-        return (state.activated(activate, batch),)
+        return (state.activate_with(activate, batch),)
 
-    def drawn(self, count: int | None = None) -> AbstractContextManager[None]:
+    def fix_count(self, count: int | None = None) -> AbstractContextManager[None]:
         """Context of a training step; nothing is sampled."""
         return nullcontext()
 
@@ -200,9 +200,9 @@ class Rounds(nn.Module):
         # The next round replaces these Gaussians: the loss needs no gradient of them.
         draft = torch.no_grad()(activate) if self.training else activate
         if state.gaussians is None:
-            state = state.activated(draft, batch)
+            state = state.activate_with(draft, batch)
         if self.options.gains and batch.log_gains is None:
-            gaussians, batch = equalized(state.gaussians, batch, state.raw.real)
+            gaussians, batch = equalize(state.gaussians, batch, state.raw.real)
             state = dataclasses.replace(state, gaussians=gaussians)
         states = [state]
         memory = torch.tanh(self.start(state.raw.descriptors))
@@ -210,29 +210,29 @@ class Rounds(nn.Module):
         rays = Rays.of(state.raw, batch)
         if isinstance(step, Tensor):
             step = step[state.raw.image // batch.masks.shape[1]]
-        count = (self._known_count or self._drawn()) if self.training else self.count
+        count = (self._known_count or self._sample_count()) if self.training else self.count
         for number in range(count):
             share = 0.5**number
             change, memory = self._round(states[-1], batch, rays, memory, windows, share, step * share)
             shown = activate if number == count - 1 else draft
-            states.append(_moved(states[-1], shown, batch, rays, *change))
+            states.append(_apply_changes(states[-1], shown, batch, rays, *change))
         return tuple(states)
 
     @contextmanager
-    def drawn(self, count: int | None = None) -> Iterator[None]:
+    def fix_count(self, count: int | None = None) -> Iterator[None]:
         """Context that fixes the number of rounds of a training step.
 
         Args:
             count: the number; None: the one already fixed, else a sampled one.
         """
         before = self._known_count
-        self._known_count = count or before or self._drawn()
+        self._known_count = count or before or self._sample_count()
         try:
             yield
         finally:
             self._known_count = before
 
-    def _drawn(self) -> int:
+    def _sample_count(self) -> int:
         """Sample the number of rounds of a training step."""
         counts = self.options.training_counts
         return counts[int(torch.randint(len(counts), ()))]
@@ -323,7 +323,7 @@ def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
     return (depth / focal[state.raw.image])[:, None]
 
 
-def _moved(
+def _apply_changes(
     state: State,
     activate: Activate,
     batch: Batch,
@@ -333,7 +333,7 @@ def _moved(
 ) -> State:
     """Apply the changes of a round: depths by ``moved`` metres along the rays, raw attributes by
     ``change``."""
-    raw = state.raw.changed(change)
+    raw = state.raw.add_change(change)
     maps = state.depth_maps
     pixels = state.points.pixels
     if raw.real is not None:

@@ -14,7 +14,7 @@ from tests.helpers.scenes import make_batch
 def voting(batch, **options):
     stage = SubjectBox(**options)
     coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, stage.dilation)
-    return stage._voting(coarse).tolist()
+    return stage._select_voting(coarse).tolist()
 
 
 def spoil(batch, wrong):

@@ -253,6 +253,6 @@ def test_the_box_of_pixels_that_are_not_square(stretch):
 def test_bounds_that_are_too_close_are_moved_apart_to_the_least_thickness():
     """By equal amounts on both sides, but not past the camera; others stay."""
     near, far = torch.tensor([[2.0, 2.0, 0.1, torch.nan], [2.004, 2.5, 0.1, torch.inf]])[:, None, None, None]
-    found = SubjectBox()._valid(DepthBounds(near, far))
+    found = SubjectBox()._make_valid(DepthBounds(near, far))
     torch.testing.assert_close(found.near.flatten(), torch.tensor([1.992, 2.0, 0.1, 0.1]))
     torch.testing.assert_close(found.far.flatten(), torch.tensor([2.012, 2.5, 0.12, 1e6]))

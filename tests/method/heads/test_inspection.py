@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from ghgs_lit.method.heads.inspection import offsets_at_limit, seen_attributes
+from ghgs_lit.method.heads.inspection import collect_attributes, offsets_at_limit
 from ghgs_lit.training import GHGSModule, Optimization
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model, predict
@@ -20,7 +20,7 @@ LIMIT = 0.05
 def saturating(batch, *overrides):
     """A model that moves half of a batch's Gaussians to their limit."""
     model = make_model(*overrides).eval()
-    with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
+    with torch.no_grad(), collect_attributes(model.gaussian_head) as seen:
         predict(model, batch)
     last = model.gaussian_head.offset_header[-1]
     middle = seen[-1].offset.abs().amax(-1).median()
@@ -33,7 +33,7 @@ def test_the_share_is_that_of_the_gaussians_of_the_prediction():
     """Offsets are recovered from the predicted positions, in world axes."""
     batch = make_batch(2, 3)
     model = saturating(batch, "model=paper", "model.frame=world")
-    with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
+    with torch.no_grad(), collect_attributes(model.gaussian_head) as seen:
         prediction = predict(model, batch)
     gaussians = prediction.gaussians
     points = prediction.points.pixels.flatten(0, 1).flatten(1, 2)[gaussians.image, gaussians.pixel]
@@ -54,7 +54,7 @@ def test_rounds_are_seen_one_after_another():
     model, batch = make_model("model=recurrent").eval(), make_batch(1, 3)
     for parameter in model.rounds.parameters():  # untrained rounds change nothing
         parameter.data.add_(0.01)
-    with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
+    with torch.no_grad(), collect_attributes(model.gaussian_head) as seen:
         prediction = predict(model, batch)
     assert len(seen) == 3
     assert not torch.equal(seen[0].offset, seen[-1].offset)
@@ -81,7 +81,7 @@ def test_validation_logs_it_where_there_is_a_limit(limit, tmp_path):
     if limit is not None:
         shares = []
         for batch in batches:
-            with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
+            with torch.no_grad(), collect_attributes(model.gaussian_head) as seen:
                 predict(model, batch)
             shares.append(offsets_at_limit(seen[-1]).item())
         assert numbers["val/offsets_at_limit"] == pytest.approx(sum(shares) / 2, abs=1e-6)

@@ -166,7 +166,7 @@ def test_windows_hold_the_subject_and_no_more():
 @pytest.mark.parametrize("full", [1, 9, 40])
 def test_a_widened_span_stays_within_its_map(full):
     for start, stop in itertools.combinations(range(full + 1), 2):
-        span = Span(start, stop, full).widened()
+        span = Span(start, stop, full).widen()
         assert 0 <= span.start <= start < stop <= span.stop <= full
         assert span.stop - span.start == min(bucket_size(stop - start), full)
 

@@ -108,8 +108,8 @@ def test_half_precision_keeps_places_exact():
     torch.nn.init.normal_(stage.block.place_proj.weight)
     seen = []
     stage.block.o_proj.register_forward_pre_hook(lambda layer, inputs: seen.append(inputs[0]))
-    moved = stage.block._moved
-    stage.block._moved = lambda *inputs: seen.append(moved(*inputs)) or seen[-1]
+    moved = stage.block._add_positions
+    stage.block._add_positions = lambda *inputs: seen.append(moved(*inputs)) or seen[-1]
     with torch.autocast("cpu", torch.bfloat16):
         found = stage(tokens, points)
     assert {value.dtype for value in seen} == {torch.float32}

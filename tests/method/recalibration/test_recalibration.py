@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
-from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
+from ghgs_lit.method.recalibration.inspection import collect_calls, neighborhoods
 from ghgs_lit.method.recalibration.recalibration import (
     RecalibrationOptions,
     Similarity,
@@ -200,7 +200,7 @@ def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, 
 def test_neighbors_that_the_ablation_keeps_are_counted(neighborhood):
     """Against sets of the nearest tokens in space and on the image plane."""
     tokens, points = scene()
-    with seen_calls(stage_of := make_stage(k=5, neighborhood=neighborhood)) as calls:
+    with collect_calls(stage_of := make_stage(k=5, neighborhood=neighborhood)) as calls:
         stage_of(tokens, points)
     stage_of(tokens, points)  # outside the context: not collected
     (call,) = calls

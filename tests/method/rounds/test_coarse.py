@@ -7,12 +7,12 @@ import torch
 
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.projection import project, unproject_maps
-from ghgs_lit.method.model import with_known_height
+from ghgs_lit.method.model import resolve_height
 from ghgs_lit.method.rounds.coarse import (
     CoarseDepths,
     coarse_sizes,
-    enlarged,
-    shrunk,
+    enlarge,
+    shrink,
     spread_tokens,
 )
 from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
@@ -64,7 +64,7 @@ def test_smaller_copies_show_the_same_scene():
     """Surface points keep their position in the image, and colours and mattes stay in place."""
     batch = with_soft_rims(make_batch(1, 3, 112, 84))
     batch = dataclasses.replace(batch, images=batch.alpha[:, :, None].expand(-1, -1, 3, -1, -1) / 2)
-    found = shrunk(batch, (56, 42), 0.125)
+    found = shrink(batch, (56, 42), 0.125)
     assert found.masks.shape[2:] == (found.cameras.height, found.cameras.width) == (56, 42)
     points = unproject_maps(batch.depths, batch.cameras).flatten(2, 3)
     pixels = [
@@ -84,14 +84,14 @@ def test_enlarged_depths_lie_on_planes_up_to_a_pixel_beyond_what_is_known():
         along = (torch.arange(side, dtype=torch.float64) + 0.5) / side
         return 1 / (0.4 + 0.1 * along[:, None] + 0.05 * along).expand(1, 1, side, side)
 
-    found = enlarged(DepthMaps(plane(24), plane(24) > 0, plane(24)), (60, 60))
+    found = enlarge(DepthMaps(plane(24), plane(24) > 0, plane(24)), (60, 60))
     # values are not extrapolated beyond the outermost centres
     inner = (..., slice(2, -2), slice(2, -2))
     torch.testing.assert_close(found[inner], plane(60)[inner], rtol=1e-12, atol=0)
     known = torch.ones(1, 1, 24, 24, dtype=torch.bool)
     known[..., :6] = False
     wrong = torch.where(known, 2.5, 9.0).double()
-    found = enlarged(DepthMaps(wrong, known, wrong), (48, 48))
+    found = enlarge(DepthMaps(wrong, known, wrong), (48, 48))
     torch.testing.assert_close(found[..., 10:], torch.full_like(found[..., 10:], 2.5))
     assert (found[..., :9] == 0).all()
 
@@ -153,12 +153,12 @@ def test_rounds_start_from_what_is_found_in_a_smaller_copy():
         of_copy, _, at_full_size = tokens
         size = coarse_sizes(batch, HEIGHT, model.encoder.patch_size)[0]
         assert tuple(copy.masks.shape[2:]) == size
-        alone = predict(model, shrunk(batch, size, None))
+        alone = predict(model, shrink(batch, size, None))
     spread = spread_tokens(of_copy, batch, 14).flatten(0, 3)
     assert torch.equal(torch.cat((*at_full_size.latent, at_full_size.semantic), -1), spread)
     start, bounds = found.rounds[0].depth, found.rounds[0].bounds
-    expected = enlarged(alone.depth_maps, (SIDE, SIDE)).clamp(bounds.near, bounds.far)
-    known = batch.masks & (enlarged(alone.depth_maps, (SIDE, SIDE)) > 0)
+    expected = enlarge(alone.depth_maps, (SIDE, SIDE)).clamp(bounds.near, bounds.far)
+    known = batch.masks & (enlarge(alone.depth_maps, (SIDE, SIDE)) > 0)
     assert known.sum() > 0.95 * batch.masks.sum()
     torch.testing.assert_close(start[known], expected[known], rtol=1e-5, atol=1e-5)
     assert not torch.equal(found.depth[known], start[known])
@@ -177,11 +177,11 @@ def test_rounds_start_from_what_is_found_in_a_smaller_copy():
 )
 def test_the_training_says_what_height_the_weights_know(trained, height, side):
     nodes = {"rounds": {"kind": "recurrent", "count": 2}, "model": {}}
-    assert with_known_height(nodes, trained) == {"rounds": {**nodes["rounds"], "height": height}, "model": {}}
+    assert resolve_height(nodes, trained) == {"rounds": {**nodes["rounds"], "height": height}, "model": {}}
     for said in (None, 60):
         nodes["rounds"]["height"] = said
-        assert with_known_height(nodes, trained) == nodes
-    assert with_known_height({"model": {}}, trained) == {"model": {}}
+        assert resolve_height(nodes, trained) == nodes
+    assert resolve_height({"model": {}}, trained) == {"model": {}}
     # subjects that fit into an image of the training are never downsampled
     if side is not None:
         batch = make_batch(1, 2, side, side)

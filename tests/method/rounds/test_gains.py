@@ -9,7 +9,7 @@ import torch
 
 from ghgs_lit.data.imperfections import sample_color_gains
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.method.rounds.gains import divided, equalized, log_gains, log_gammas
+from ghgs_lit.method.rounds.gains import divide_by_gains, equalize, log_gains, log_gammas
 from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, surface_splats, with_soft_rims
 
@@ -51,7 +51,7 @@ def test_gains_are_found(seed):
     assert np.abs(np.log(gains)).max() > 0.1
     np.testing.assert_allclose(found, np.log(gains), atol=0.03)
     before, after = (
-        (x.images - batch.images).abs().mean() for x in (dark, equalized(surface_splats(dark), dark)[1])
+        (x.images - batch.images).abs().mean() for x in (dark, equalize(surface_splats(dark), dark)[1])
     )
     assert after < 0.2 * before
 
@@ -152,7 +152,7 @@ def test_photographs_that_are_divided_already_are_not_equalized_again():
     batch = painted()
     dark, logs = seen_with(batch, drawn(batch)), torch.zeros(1, 4, 3)
     logs[0, 1], logs[0, 3] = 0.1, -2.0
-    known = divided(dark, logs)
+    known = divide_by_gains(dark, logs)
     torch.testing.assert_close(known.images[0, 1], dark.images[0, 1] * math.exp(-0.1))
     assert torch.equal(known.images[0, 2], dark.images[0, 2])
     torch.testing.assert_close(known.images[0, 3], (dark.images[0, 3] * math.exp(2)).clamp(max=1))

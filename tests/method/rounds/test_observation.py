@@ -9,7 +9,7 @@ import torch
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.method.rounds.observation import SLOPES, looked_up, observe, slopes
+from ghgs_lit.method.rounds.observation import SLOPES, observe, sample_maps, slopes
 from ghgs_lit.ops.observation import CHANNELS
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch
@@ -175,9 +175,9 @@ def test_elements_of_different_sizes_are_looked_up_as_one_by_one():
     first, _, last = (whole[i] for i in range(3))
     few = torch.cat((torch.arange(7), len(first) + len(whole[1]) + torch.arange(len(last))))
     gaussians = whole.select(few, (7, 0, len(last)))
-    found = looked_up(gaussians, batch.cameras, batch.images)
-    alone = [looked_up(gaussians[i], batch.cameras[i : i + 1], batch.images[i : i + 1]) for i in (0, 2)]
+    found = sample_maps(gaussians, batch.cameras, batch.images)
+    alone = [sample_maps(gaussians[i], batch.cameras[i : i + 1], batch.images[i : i + 1]) for i in (0, 2)]
     for values, each in zip(found, zip(*alone, strict=True), strict=True):
         assert torch.equal(values, torch.cat(each))
-    nothing = looked_up(gaussians[1], batch.cameras[:1], batch.images[:1])
+    nothing = sample_maps(gaussians[1], batch.cameras[:1], batch.images[:1])
     assert [tuple(values.shape) for values in nothing] == [(0, 3, 3), (0, 3, 1), (0, 3, 1)]
