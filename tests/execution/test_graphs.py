@@ -27,7 +27,7 @@ def no_gradient():
         yield
 
 
-def made(**options):
+def make_cache(**options):
     return GraphCache(backend=OperatorBackend(HERE), **options)
 
 
@@ -48,13 +48,13 @@ def work(values):
 
 def test_other_values_give_what_an_eager_call_gives():
     """From the third call on only the graph runs, and results are not overwritten."""
-    cache, calls = made(), []
+    cache, calls = make_cache(), []
 
-    def counted(values):
+    def count_calls(values):
         calls.append(None)
         return work(values)
 
-    found = [cache(counted, (numbers(seed), numbers(seed + 50))) for seed in range(6)]
+    found = [cache(count_calls, (numbers(seed), numbers(seed + 50))) for seed in range(6)]
     for seed, result in enumerate(found):
         wanted = work((numbers(seed), numbers(seed + 50)))
         assert torch.equal(result["best"], wanted["best"])
@@ -67,16 +67,16 @@ def test_other_values_give_what_an_eager_call_gives():
 
 def test_dataclasses_come_back_with_what_they_keep():
     """Attributes that are not fields are inputs like fields: captured functions may depend on them."""
-    cache = made()
+    cache = make_cache()
 
-    def moved(cameras):
+    def move(cameras):
         extrinsics = cameras.extrinsics + vars(cameras)["noted"]
         return dataclasses.replace(cameras, extrinsics=extrinsics)
 
     for seed in range(4):
         cameras = Cameras(numbers(seed, 2, 3, 3), numbers(seed, 2, 4, 4), 5, 6)
         vars(cameras)["noted"] = numbers(seed + 9, 2, 4, 4)
-        found = cache(moved, cameras)
+        found = cache(move, cameras)
         assert torch.equal(found.extrinsics, cameras.extrinsics + vars(cameras)["noted"])
         assert (found.height, found.width) == (5, 6)
     assert cache.counts["replayed"] == 2
@@ -84,7 +84,7 @@ def test_dataclasses_come_back_with_what_they_keep():
 
 def test_what_a_call_keeps_is_computed_by_the_graph():
     """Values cached by the call before the capture belong to its inputs, and must be recomputed."""
-    cache = made()
+    cache = make_cache()
 
     def shifted(batch):
         return batch.images + batch.once(of_images)
@@ -129,7 +129,7 @@ NAMES = ["shape", "dtype", "number", "type", "structure", "key", "autocast", "gr
 @pytest.mark.parametrize("name", NAMES)
 def test_each_difference_is_another_bucket(name):
     """Everything that a graph fixes must be equal."""
-    cache = made()
+    cache = make_cache()
     for each in ("usual", "usual", name, "usual"):
         case = other_bucket(each)
         with case["around"]:
@@ -183,7 +183,7 @@ REFUSED = {
 @pytest.mark.parametrize("function", REFUSED)
 def test_what_cannot_be_replayed_stays_eager(function):
     """A warning gives the reason once, and results are right."""
-    cache = made()
+    cache = make_cache()
     cache(function, (numbers(0), numbers(1)))
     with pytest.warns(UserWarning, match=REFUSED[function]):
         cache(function, (numbers(0), numbers(1)))
@@ -231,7 +231,7 @@ def test_tensors_of_other_devices_are_not_captured():
 
 def test_an_unhashable_value_is_eager():
     """It cannot be compared with that of the captured call."""
-    cache = made()
+    cache = make_cache()
     for _ in range(3):
         cache(lambda values: values[0] + 1, (numbers(0), {"a": {1}}))
     assert cache.counts == {"eager": 3}
@@ -239,7 +239,7 @@ def test_an_unhashable_value_is_eager():
 
 def test_the_least_recently_used_graph_makes_room():
     """An evicted graph is captured again when its bucket returns."""
-    cache = made(limit=2)
+    cache = make_cache(limit=2)
     for size in (1, 1, 2, 2, 1, 3, 3):  # 2 is evicted
         cache(lambda x: x + 1, numbers(0, size))
     assert cache.counts == {"eager": 3, "captured": 3, "replayed": 1}
@@ -251,7 +251,7 @@ def test_the_least_recently_used_graph_makes_room():
 
 def test_memory_of_caches_is_kept():
     """A cache may drop a table that a graph reads."""
-    cache = made()
+    cache = make_cache()
     address = table(3).data_ptr()
     for seed in range(3):
         found = cache(lambda x: x + table(3), numbers(seed))
@@ -265,7 +265,7 @@ def test_memory_of_caches_is_kept():
 
 def test_weights_that_change_in_place_are_read():
     """Training updates weights in place; if they move, everything is captured again."""
-    cache, layer = made(), nn.Linear(3, 2)
+    cache, layer = make_cache(), nn.Linear(3, 2)
     for seed in range(3):
         cache(layer, numbers(seed))
     layer.weight.add_(1.0)
@@ -279,7 +279,7 @@ def test_weights_that_change_in_place_are_read():
 
 def test_casts_of_weights_are_captured_with_what_reads_them():
     """Autocast shares casts within a context; a replay must cast the weights again."""
-    cache, layer = made(), nn.Linear(3, 2)
+    cache, layer = make_cache(), nn.Linear(3, 2)
     with bfloat16():
         for seed in range(3):
             cache(layer, numbers(seed))
@@ -290,7 +290,7 @@ def test_casts_of_weights_are_captured_with_what_reads_them():
 
 def test_where_memory_is_lacking_graphs_make_room():
     """Graphs of all caches are freed; without any, or if a call has written, the error is raised."""
-    holder, other = made(), made()
+    holder, other = make_cache(), make_cache()
     for seed in range(2):
         holder(work, (numbers(seed), numbers(seed)))
     failures = iter([True, False, True, True])
@@ -301,7 +301,7 @@ def test_where_memory_is_lacking_graphs_make_room():
         return values + 1
 
     with pytest.raises(torch.OutOfMemoryError):
-        made()(large, numbers(0), written=[torch.ones(1)])
+        make_cache()(large, numbers(0), written=[torch.ones(1)])
     assert holder._graphs
     failures = iter([True, False, True])
     with pytest.warns(UserWarning, match="too little memory"):
@@ -317,7 +317,7 @@ def test_where_memory_is_lacking_graphs_make_room():
 def test_a_capture_that_finds_too_little_memory_is_let_go_first():
     """The call that follows needs the memory that the error would keep alive. Graphs are freed, and later
     calls are captured again."""
-    holder, cache, alive, calls = made(), made(), [], []
+    holder, cache, alive, calls = make_cache(), make_cache(), [], []
     for seed in range(2):
         holder(work, (numbers(seed), numbers(seed)))
 

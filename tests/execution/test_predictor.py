@@ -29,7 +29,7 @@ def there():
     torch.set_num_threads(threads)
 
 
-def capturing(*overrides):
+def make_predictor(*overrides):
     """A predictor that captures."""
     predictor = Predictor(make_model(*overrides).eval().to(DEVICE))
     predictor.graphs = GraphCache(limit=16, backend=OperatorBackend())
@@ -47,13 +47,13 @@ def counts(predictor):
     return dict(predictor.graphs.counts)
 
 
-def eager(predictor, batch):
+def predict_eagerly(predictor, batch):
     """The prediction with ``model.capture=off``."""
     options = predictor.options.replace(capture="off")
     return Predictor(predictor.model, options, predictor.precision)(batch)
 
 
-def differs(found, wanted):
+def largest_difference(found, wanted):
     """Largest difference between the Gaussians of two predictions."""
     pairs = ((getattr(each.gaussians, name).cpu() for each in (found, wanted)) for name in ATTRIBUTES)
     return max(float((one - other).abs().max()) for one, other in pairs)
@@ -62,10 +62,10 @@ def differs(found, wanted):
 @pytest.mark.parametrize("kind", [("model=paper", "skip=fast"), ("model=recurrent",)], ids=str)
 def test_other_scenes_of_a_bucket_are_predicted_as_eagerly(kind):
     """With other masks and colours, and as many Gaussians as each scene has pixels."""
-    model = capturing(*kind)
+    model = make_predictor(*kind)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (3, 1.0)):
         batch = scene(holes=holes, color=color)
-        found, wanted = model(batch), eager(model, batch)
+        found, wanted = model(batch), predict_eagerly(model, batch)
         assert len(found.gaussians) == int(batch.masks.cpu().sum()) == len(wanted.gaussians)
         close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
         torch.testing.assert_close(found.depth.cpu(), wanted.depth.cpu(), rtol=1e-5, atol=1e-5)
@@ -75,11 +75,11 @@ def test_other_scenes_of_a_bucket_are_predicted_as_eagerly(kind):
 def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
     """Both are replayed: the stages for the copies, and at full size, which start from their depths and
     tokens."""
-    model = capturing("model=recurrent", "rounds.height=14")
+    model = make_predictor("model=recurrent", "rounds.height=14")
     for color in (1.0, 0.9, 0.8, 0.7):
         batch = scene(0.3, color)
         assert model.needs_copies(batch)
-        found, wanted = model(batch), eager(model, batch)
+        found, wanted = model(batch), predict_eagerly(model, batch)
         close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
     # Work before the plan, the stages for copies, and those at full size.
     assert counts(model) == {"eager": 3, "captured": 3, "replayed": 6}
@@ -87,7 +87,7 @@ def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
 
 def test_what_changes_a_prediction_is_another_bucket():
     """Sizes, the number of rounds, and the encoder's choice of patches."""
-    model = capturing("model=recurrent", "encoder.semantic=null")
+    model = make_predictor("model=recurrent", "encoder.semantic=null")
     for _ in range(2):
         model(scene())
     model.model.rounds.count = 1
@@ -100,7 +100,7 @@ def test_what_changes_a_prediction_is_another_bucket():
 
 def test_what_is_watched_or_has_a_gradient_is_called():
     """Watchers must observe every stage, and a graph has no gradient."""
-    model = capturing("model=paper")
+    model = make_predictor("model=paper")
     for _ in range(2):
         model(scene())
     before = counts(model)
@@ -108,7 +108,7 @@ def test_what_is_watched_or_has_a_gradient_is_called():
         model(scene())
     with torch.enable_grad():
         assert model(scene()).gaussians.means.requires_grad
-    eager(model, scene())
+    predict_eagerly(model, scene())
     model.model.train()
     model(scene())
     # Work before the plan is replayed even with gradients, and from another bucket in training.
@@ -117,7 +117,7 @@ def test_what_is_watched_or_has_a_gradient_is_called():
 
 def test_too_little_room_is_followed_by_another_capture(monkeypatch):
     """The first graph, whose capacity would be too small again, is dropped."""
-    model, batch = capturing("model=recurrent"), scene()
+    model, batch = make_predictor("model=recurrent"), scene()
     for _ in range(3):
         wanted = model(batch)
     suffice = iter([False])
@@ -154,20 +154,20 @@ def replaced_attribute(model):
 )
 def test_a_changed_model_is_not_replayed(change):
     """After any replacement, also within a stage, the result equals that of an eager call."""
-    predictor, batch = capturing("model=paper"), scene()
+    predictor, batch = make_predictor("model=paper"), scene()
     for _ in range(3):
         before = predictor(batch)
     change(predictor.model)
     for _ in range(3):
         found = predictor(batch)
-        assert differs(found, eager(predictor, batch)) < 1e-6
-        assert differs(found, before) > 1e-5
+        assert largest_difference(found, predict_eagerly(predictor, batch)) < 1e-6
+        assert largest_difference(found, before) > 1e-5
     assert counts(predictor)["captured"] > 2  # including those of the previous model
 
 
 def test_hooks_and_replaced_methods_are_called_every_time():
     """Of any module, also within a stage; after their removal, predictions are replayed again."""
-    predictor, batch, calls = capturing("model=paper"), scene(), []
+    predictor, batch, calls = make_predictor("model=paper"), scene(), []
     head = predictor.model.gaussian_head
     activate = head.activate
 
@@ -196,10 +196,10 @@ def test_hooks_and_replaced_methods_are_called_every_time():
 @pytest.mark.parametrize(("kind", "size"), [("model=paper", 24), ("model=recurrent", 22)])
 def test_padded_views_are_captured(kind, size):
     """Sides that are not multiples of the patch size give the result of an eager call."""
-    predictor = capturing(kind, "model.pad=multiple")
+    predictor = make_predictor(kind, "model.pad=multiple")
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (0, 0.7)):
         batch = scene(size=size, holes=holes, color=color)
-        found, wanted = predictor(batch), eager(predictor, batch)
+        found, wanted = predictor(batch), predict_eagerly(predictor, batch)
         assert found.depth.shape == wanted.depth.shape == batch.masks.shape
         close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
         assert torch.equal(found.gaussians.pixel.cpu(), wanted.gaussians.pixel.cpu())
@@ -207,7 +207,7 @@ def test_padded_views_are_captured(kind, size):
 
 
 def test_a_copy_captures_anew():
-    predictor = capturing("model=paper")
+    predictor = make_predictor("model=paper")
     for _ in range(2):
         predictor(scene())
     twin = copy.deepcopy(predictor)
@@ -217,7 +217,7 @@ def test_a_copy_captures_anew():
 
 def test_a_replay_launches_few_kernels(there):
     """Only launches for inputs and the plan remain, and synchronisations do not increase."""
-    model, batch, counted = capturing("model=recurrent"), scene(), []
+    model, batch, counted = make_predictor("model=recurrent"), scene(), []
     model.graphs.backend = SilentBackend()
     for _ in range(3):
         there.clear()
@@ -231,7 +231,7 @@ def test_a_replay_launches_few_kernels(there):
 
 def test_what_precedes_the_plan_keeps_names_and_gradients():
     """Batches that differ only in names share a bucket; images that require gradients get them."""
-    model = capturing("model=paper")
+    model = make_predictor("model=paper")
     for name in ("a", "b", "c"):
         batch = dataclasses.replace(scene(), subjects=(name,), views=(("0", "1"),))
         inside, *_ = model.prepare(batch)

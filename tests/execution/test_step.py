@@ -44,7 +44,7 @@ def training(*overrides):
     return make_model(*overrides, *two).to(DEVICE).train()
 
 
-def capturing(model, losses=LOSSES, backend=OperatorBackend, capture="auto"):
+def make_step(model, losses=LOSSES, backend=OperatorBackend, capture="auto"):
     """The captured step of a model."""
     predictor = Predictor(model)
     predictor.options = predictor.options.replace(capture=capture)
@@ -67,7 +67,7 @@ def scene(size=1, color=1.0, holes=0, side=28):
     return dataclasses.replace(batch, depths=2.0 * batch.masks, body_vertices=bodies).to(DEVICE)
 
 
-def slopes(model, total):
+def gradients_of(model, total):
     """Gradients of a loss by the names of weights, on the CPU."""
     model.zero_grad()
     total.backward()
@@ -75,7 +75,7 @@ def slopes(model, total):
     return {name: slope.cpu() for name, slope in named if slope is not None}
 
 
-def called(model, batch, losses=LOSSES):
+def call_eagerly(model, batch, losses=LOSSES):
     """The loss and its terms, computed eagerly."""
     prediction = Predictor(model)(batch)
     rendering = Renderer()(prediction.gaussians, batch.targets.cameras)
@@ -94,18 +94,18 @@ def called(model, batch, losses=LOSSES):
 def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, losses, side):
     """For other batches of a shape bucket, also with gradient accumulation and padded views."""
     model = training(*kind)
-    captured = capturing(model, losses)
+    captured = make_step(model, losses)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8)):
         batch = scene(size, color, holes, side)
-        total, values, gaussians = called(model, batch, losses)
-        wanted = slopes(model, total / 2)
+        total, values, gaussians = call_eagerly(model, batch, losses)
+        wanted = gradients_of(model, total / 2)
         found = captured(batch)
         assert found.gaussians == gaussians
         torch.testing.assert_close(found.total.detach().cpu(), total.detach().cpu(), rtol=1e-6, atol=0)
         assert {name: float(value.cpu()) for name, value in found.values.items()} == pytest.approx(
             {name: float(value.detach().cpu()) for name, value in values.items()}, rel=1e-6
         )
-        slope = slopes(model, found.total / 2)
+        slope = gradients_of(model, found.total / 2)
         assert slope.keys() == wanted.keys()
         for name in wanted:
             assert (slope[name] - wanted[name]).abs().max() <= 1e-5 * wanted[name].abs().max(), name
@@ -115,12 +115,12 @@ def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, los
 def test_a_factor_of_the_loss_changes_no_gradient():
     """For a constant or changing factor, gradients equal those of an eager step."""
     model, batch = training("model=paper"), scene()
-    captured = capturing(model)
-    wanted = slopes(model, called(model, batch)[0])
+    captured = make_step(model)
+    wanted = gradients_of(model, call_eagerly(model, batch)[0])
     for exponent in (10, 16, 12):
         scale = torch.full((), 2.0**exponent, device=DEVICE)
         found = captured(batch, scale)
-        slope = slopes(model, found.total * scale)
+        slope = gradients_of(model, found.total * scale)
         for name in wanted:
             wrong = (slope[name] / 2.0**exponent - wanted[name]).abs().max()
             assert wrong <= 1e-5 * wanted[name].abs().max(), name
@@ -140,20 +140,20 @@ def test_gradients_of_float16_do_not_underflow():
 def test_weights_that_move_are_read_where_they_are():
     """An optimizer updates weights in place; the next replay reads them."""
     model, batch = training("model=paper"), scene()
-    captured = capturing(model)
+    captured = make_step(model)
     optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
     totals = []
     for _ in range(4):
         found = captured(batch)
         totals.append(float(found.total.detach().cpu()))
-        wanted = float(called(model, batch)[0].detach().cpu())
+        wanted = float(call_eagerly(model, batch)[0].detach().cpu())
         assert totals[-1] == pytest.approx(wanted, rel=1e-6)
-        slopes(model, found.total)
+        gradients_of(model, found.total)
         optimizer.step()
     assert len(set(totals)) == 4
 
 
-def trained(folder, capture):
+def train(folder, capture):
     """Weights after four steps of two batches each, and the number of replays."""
     model = training("model=hull")
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, warmup=0.0))
@@ -172,7 +172,7 @@ def trained(folder, capture):
 
 def test_a_training_comes_to_the_same_weights(tmp_path):
     """With Lightning's loop, gradient accumulation and clipping."""
-    (wanted, none), (found, replayed) = (trained(tmp_path, capture) for capture in ("off", "auto"))
+    (wanted, none), (found, replayed) = (train(tmp_path, capture) for capture in ("off", "auto"))
     assert (none, replayed) == (0, 6)
     for name in wanted:
         torch.testing.assert_close(found[name], wanted[name], rtol=1e-4, atol=1e-5, msg=name)
@@ -221,7 +221,7 @@ def test_a_step_of_a_training_launches_few_kernels(there, tmp_path, monkeypatch)
 
 def test_numbers_of_rounds_are_sampled_once_and_are_a_bucket_each():
     model, batch = training("model=recurrent"), scene()
-    captured = capturing(model)
+    captured = make_step(model)
     for count in (1, 1, 2, 1):
         with model.rounds.fix_count(count):
             captured(batch)
@@ -229,7 +229,7 @@ def test_numbers_of_rounds_are_sampled_once_and_are_a_bucket_each():
 
 
 def test_too_little_room_is_followed_by_another_capture(monkeypatch):
-    captured, batch = capturing(training("model=paper")), scene()
+    captured, batch = make_step(training("model=paper")), scene()
     for _ in range(3):
         captured(batch)
     suffice = iter([False])
@@ -241,8 +241,8 @@ def test_too_little_room_is_followed_by_another_capture(monkeypatch):
 def test_a_batch_that_does_not_fit_is_called_and_prepared_once(monkeypatch):
     """For instance one with subjects so tall that downsampled copies are used."""
     model, batch = training("model=paper"), scene()
-    wanted = float(called(model, batch)[0].detach().cpu())
-    captured, calls = capturing(model), []
+    wanted = float(call_eagerly(model, batch)[0].detach().cpu())
+    captured, calls = make_step(model), []
     predictor = captured.predictor
     prepare = predictor.prepare
     monkeypatch.setattr(predictor, "prepare", lambda *given: calls.append(given) or prepare(*given))
@@ -257,16 +257,16 @@ def test_sizes_are_kept_while_they_are_enough():
     """Smaller subjects are replayed, a larger one increases the sizes with a margin, and results do not
     change."""
     model = training("model=hull", "skip=fast")
-    captured = capturing(model)
+    captured = make_step(model)
     for share in (0.1, 0.1, 0.07, 0.16, 0.17, 0.05):
         batch = dataclasses.replace(ellipsoid_batch(share, 3, 56, 1), subjects=("a",)).to(DEVICE)
         batch = dataclasses.replace(batch, depths=2.0 * batch.masks)
-        total, _, gaussians = called(model, batch)
-        wanted = slopes(model, total)
+        total, _, gaussians = call_eagerly(model, batch)
+        wanted = gradients_of(model, total)
         found = captured(batch)
         assert found.gaussians == gaussians
         torch.testing.assert_close(found.total.detach().cpu(), total.detach().cpu(), rtol=1e-5, atol=0)
-        slope = slopes(model, found.total)
+        slope = gradients_of(model, found.total)
         for name in wanted:
             assert (slope[name] - wanted[name]).norm() <= 1e-4 * wanted[name].norm() + 1e-9, name
     assert dict(captured.graphs.counts) == {"eager": 2, "captured": 2, "replayed": 2}
@@ -276,7 +276,7 @@ def test_what_cannot_be_captured_is_called(monkeypatch):
     """Other devices, renderers and losses, float16 without a loss scale, predictions, and
     ``model.capture=off`` run eagerly."""
     model, batch = training("model=paper"), scene()
-    captured = capturing(model)
+    captured = make_step(model)
     assert captured.captures(batch)
     assert not captured.captures(batch.to("cpu"))
     for parts in ((lambda *_: None, LOSSES), (Renderer(), lambda *_: None)):
@@ -291,13 +291,13 @@ def test_what_cannot_be_captured_is_called(monkeypatch):
     model.encoder.aggregator.patch_embed.cache = None
     model.eval()
     assert not captured.captures(batch)
-    assert not capturing(model.train(), capture="off").captures(batch)
+    assert not make_step(model.train(), capture="off").captures(batch)
 
 
 def test_hooks_see_every_step():
     """A step of a model with hooks runs eagerly."""
     model, batch, calls = training("model=paper"), scene(), []
-    captured = capturing(model)
+    captured = make_step(model)
     model.encoder.register_forward_hook(lambda *_: calls.append(1))
     with pytest.warns(UserWarning, match="eagerly: a hook of encoder"):
         captured(batch)
@@ -326,7 +326,7 @@ def test_times_of_a_step_do_not_keep_it_from_being_captured():
     """The timing callback of every training wraps stages only in eager steps."""
     model = training("model=paper")
     for capture, is_free in (("auto", True), ("off", False)):
-        captured = capturing(model, capture=capture)
+        captured = make_step(model, capture=capture)
         module = SimpleNamespace(
             model=model, renderer=Renderer(), losses=LOSSES, device=DEVICE, ready=None, captured_step=captured
         )

@@ -16,7 +16,7 @@ from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import CENTER, ellipsoid, make_batch, ring
 
 
-def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
+def move_cameras(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
     """The cameras of a batch in a world that was scaled, rotated and translated, in float64."""
     turn = torch.eye(3).double() if turn is None else turn
     extrinsics = cameras.extrinsics.double().clone()
@@ -30,7 +30,7 @@ def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
 def original(name):
     """A tiny model, a batch with cameras in float64, its prediction and a render."""
     model, batch = make_model(f"model={name}").eval(), make_batch(1, 3)
-    batch = dataclasses.replace(batch, cameras=moved(batch.cameras))
+    batch = dataclasses.replace(batch, cameras=move_cameras(batch.cameras))
     with torch.no_grad():
         prediction = predict(model, batch)
     return model, batch, prediction, render(prediction.gaussians, batch.cameras)
@@ -48,7 +48,7 @@ def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away
     model, batch, expected, image = original(name)
     turn = quaternion_to_matrix(torch.tensor(turn).double())
     shift = (away * scale, -0.3 * away * scale, 0.1 * away * scale)
-    views = moved(batch.cameras, scale, turn, shift)
+    views = move_cameras(batch.cameras, scale, turn, shift)
     with torch.no_grad():
         found = predict(model, dataclasses.replace(batch, cameras=views))
         shown = render(found.gaussians, views)
@@ -77,7 +77,7 @@ def test_the_subject_is_as_tall_as_a_person_in_its_frame():
     """An ellipsoid of 1.6 m becomes 1.8 m tall, in a world in millimetres as in metres."""
     batch = make_batch(2, 4, 112, 112)
     for scale in (1.0, 1e3):
-        frame = Frame.of(dataclasses.replace(batch, cameras=moved(batch.cameras, scale)))
+        frame = Frame.of(dataclasses.replace(batch, cameras=move_cameras(batch.cameras, scale)))
         assert (frame.metre * HEIGHT / scale - 1.6).abs().max() < 0.1
         assert (frame.origin / scale - CENTER).abs().max() < 0.06
         assert frame.enter(batch).cameras.extrinsics.dtype == torch.float32

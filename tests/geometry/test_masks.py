@@ -19,7 +19,7 @@ from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
 from tests.helpers.scenes import make_batch
 
 
-def matted():
+def matted_batch():
     """Images of known colours, premultiplied by mattes that include 0 and 1."""
     batch = make_batch(2, 3)
     generator = torch.Generator().manual_seed(2)
@@ -33,7 +33,7 @@ def matted():
 
 def test_colors_are_those_before_premultiplication():
     """Pixels with a matte of 0 are unchanged, and rounding errors of a file give no colour above 1."""
-    colors, batch = matted()
+    colors, batch = matted_batch()
     shown = (batch.alpha > 0)[:, :, None]
     found = surface_colors(batch)
     torch.testing.assert_close(found, torch.where(shown, colors, batch.images))
@@ -46,7 +46,7 @@ def test_colors_are_those_before_premultiplication():
 
 def test_without_a_matte_nothing_changes():
     """With binary masks, images are returned unchanged and masks as shares."""
-    _, batch = matted()
+    _, batch = matted_batch()
     plain = dataclasses.replace(batch, alpha=None)
     assert surface_colors(plain) is plain.images
     assert torch.equal(coverage(plain), plain.masks.float())
@@ -56,7 +56,7 @@ def test_without_a_matte_nothing_changes():
 
 def test_masks_grow_to_what_shows_enough_of_the_subject():
     """Masks follow a threshold of the matte; None drops the matte."""
-    _, batch = matted()
+    _, batch = matted_batch()
     grown = with_matte(batch, 0.125)
     assert torch.equal(grown.masks, batch.alpha > 0.125)
     assert grown.alpha is batch.alpha

@@ -104,14 +104,14 @@ def test_products_round_where_convolutions_do_which_is_said_once():
     _warn_rounding.cache_clear()
     before = state()
     with pytest.warns(UserWarning, match="precision=inherit: factors of products are rounded to TF32"):
-        _entered("inherit")
+        _state_inside("inherit")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert _entered("inherit")[:4] == ["tf32"] * 4
+        assert _state_inside("inherit")[:4] == ["tf32"] * 4
     assert state() == before
 
 
-def _entered(name):
+def _state_inside(name):
     """State of the switches within a context."""
     with precision_of(name, CUDA):
         return state()
@@ -126,7 +126,7 @@ def test_what_a_process_has_chosen_is_inherited(setting):
     """A chosen precision is kept, such as float32 in convolutions by ``trainer.precision=32-true``."""
     setting()
     before = state()
-    assert _entered("inherit") == before
+    assert _state_inside("inherit") == before
 
 
 @pytest.mark.parametrize("kind", ["model=paper", "model=hull"])

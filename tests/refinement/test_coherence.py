@@ -44,7 +44,7 @@ def figure(batch=1, views=4, size=126):
     return dataclasses.replace(frame.enter(batch), depths=depths)
 
 
-def bumped(truth, off_by, seed):
+def bump_cameras(truth, off_by, seed):
     """The batch with some cameras (keys) moved by up to the given pixels."""
     poses = truth.cameras.extrinsics.clone()
     for view, pixels in off_by.items():
@@ -208,7 +208,7 @@ def test_a_step_follows_the_motion_that_took_cameras_away(monkeypatch):
 def test_a_minority_that_explains_all_moves_alone(views, off_by, seed):
     """Cameras that agree with one another are right; of five, two may be off."""
     truth = figure(views=views)
-    wrong = bumped(truth, off_by, seed)
+    wrong = bump_cameras(truth, off_by, seed)
     found, free, _ = coherent_cameras(wrong)
     assert free.tolist() == [[view in off_by for view in range(views)]]
     for name in ("intrinsics", "extrinsics"):

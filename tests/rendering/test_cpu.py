@@ -47,7 +47,7 @@ def equal_depths():
     )
 
 
-def changed(**factors):
+def scale_fields(**factors):
     """Gaussians with some of their fields multiplied."""
     gaussians = cloud(50)
     return dataclasses.replace(
@@ -203,9 +203,9 @@ def test_gradients_of_only_some_inputs():
 def test_neither_signs_of_scales_nor_norms_of_quaternions_matter(factors):
     views = camera_ring(1, 24, 24)
     for backend in ("cpu", "reference"):
-        found = render(changed(**factors), views, backend).image
+        found = render(scale_fields(**factors), views, backend).image
         torch.testing.assert_close(found, render(cloud(50), views, backend).image, rtol=0, atol=1e-6)
-    assert_cpu_matches_reference(changed(**factors), views)
+    assert_cpu_matches_reference(scale_fields(**factors), views)
 
 
 def test_the_zero_quaternion_is_identity_without_gradient():

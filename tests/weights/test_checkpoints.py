@@ -71,7 +71,7 @@ def of_torch(content):
     return make
 
 
-def changed(**changes):
+def edit(**changes):
     """Bytes of a checkpoint with other entries."""
     return lambda folder: checkpoint(folder / "changed.ckpt", **changes).read_bytes()
 
@@ -103,15 +103,15 @@ BAD_FILES = {
     "a safetensors model": (a_safetensors, r"'state_dict'.*; found 'depth_head.* and \d+ more"),
     "published weights": (of_torch({"network": {}, "optimizer": {}}), "`ghgs import` makes one"),
     "a bare tensor": (of_torch(torch.ones(2)), "'state_dict'.*; found a Tensor"),
-    "no config": (changed(config=None), "'config'"),
-    "no version": (changed(format_version=None), "'format_version'"),
-    "newer": (changed(format_version=SHARING + 1), "of a newer version"),
-    "version 0": (changed(format_version=0), "format_version 1 to"),
+    "no config": (edit(config=None), "'config'"),
+    "no version": (edit(format_version=None), "'format_version'"),
+    "newer": (edit(format_version=SHARING + 1), "of a newer version"),
+    "version 0": (edit(format_version=0), "format_version 1 to"),
     "other model": (
-        changed(config=config("gaussian_head.hidden=[64,32]")),
+        edit(config=config("gaussian_head.hidden=[64,32]")),
         r"gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)",
     ),
-    "no tensors": (changed(state_dict={}), "encoder.*expected a tensor of shape"),
+    "no tensors": (edit(state_dict={}), "encoder.*expected a tensor of shape"),
     "wrong shape": (
         changed_state(lambda s: s.update({TOKEN: torch.ones(3)})),
         r"camera_token: expected shape \(1, 2, 1, 32\) .*; found \(3,\)",
@@ -131,18 +131,18 @@ BAD_FILES = {
         changed_state(lambda s: s.update({TOKEN: torch.ones(1, 2, 1, 32).int()})),
         "expected floating point numbers; found torch.int32",
     ),
-    "no names": (changed(state_dict={3: TENSOR}), "state_dict: expected names of tensors; found 3"),
-    "sparse": (changed(state_dict={"model.a": TENSOR.to_sparse()}), "model.a: expected a dense tensor"),
-    "on no device": (changed(state_dict={"model.a": TENSOR.to("meta")}), "model.a: expected a dense tensor"),
-    "8 bits": (changed(state_dict={"model.a": TENSOR.to(torch.float8_e4m3fn)}), "model.a: .*float8"),
+    "no names": (edit(state_dict={3: TENSOR}), "state_dict: expected names of tensors; found 3"),
+    "sparse": (edit(state_dict={"model.a": TENSOR.to_sparse()}), "model.a: expected a dense tensor"),
+    "on no device": (edit(state_dict={"model.a": TENSOR.to("meta")}), "model.a: expected a dense tensor"),
+    "8 bits": (edit(state_dict={"model.a": TENSOR.to(torch.float8_e4m3fn)}), "model.a: .*float8"),
     "expanded": (
-        changed(state_dict={"model.a": torch.zeros(1).expand(1 << 40)}),
+        edit(state_dict={"model.a": torch.zeros(1).expand(1 << 40)}),
         "model.a: expected as many bytes as .*; found 4",
     ),
-    "config of numbers": (changed(config={3: {}}), "config: expected keys of text; found 3"),
+    "config of numbers": (edit(config={3: {}}), "config: expected keys of text; found 3"),
     **{
         f"config.{node}": (
-            changed(config={**config(), node: value}),
+            edit(config={**config(), node: value}),
             rf"config\.{node}: expected a mapping",
         )
         for node, value in (("data", []), ("model", "text"), ("skip", 3), ("encoder", "vggt_nano"))
@@ -222,14 +222,14 @@ def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
     assert called == []
 
 
-def loop():
+def cyclic_mapping():
     """A mapping that contains itself."""
     node = {"kind": "scans"}
     node["split"] = [node]
     return node
 
 
-def doubled(levels=40):
+def nest(levels=40):
     """A few hundred bytes that expand to a billion values."""
     node = {"a": 1}
     for _ in range(levels):
@@ -237,7 +237,7 @@ def doubled(levels=40):
     return node
 
 
-@pytest.mark.parametrize("many", [loop(), {"kind": "scans", "x": doubled(20)}, doubled(60)])
+@pytest.mark.parametrize("many", [cyclic_mapping(), {"kind": "scans", "x": nest(20)}, nest(60)])
 def test_a_configuration_without_end_is_refused(tmp_path, many):
     """Regression: references in PyTorch's files led to tracebacks about recursion or memory, or no end at
     all."""

@@ -67,7 +67,7 @@ def test_the_shipped_file_has_checksums(tmp_path):
             load_model(path)
 
 
-def packed_again(path, compression):
+def repack(path, compression):
     """Rewrite the records of a PyTorch file, as a repair program for archives does."""
     with zipfile.ZipFile(path) as archive:
         records = {record.filename: archive.read(record) for record in archive.infolist()}
@@ -95,11 +95,11 @@ def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
     """PyTorch maps records as stored: all weights would silently be other numbers."""
     path = tmp_path / "a.ckpt"
     torch.save(content(), path)
-    packed_again(path, zipfile.ZIP_STORED)
+    repack(path, zipfile.ZIP_STORED)
     assert load_model(path)
     kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
     for compression in kinds if reader == "any file of weights" else kinds[:1]:
-        packed_again(path, compression)
+        repack(path, compression)
         with pytest.raises(
             InputError, match=r"a\.ckpt: expected .*; found a compressed or encrypted record \(a/"
         ):

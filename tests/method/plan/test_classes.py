@@ -25,10 +25,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def rounding(monkeypatch):
     """Turns shape buckets on and off."""
 
-    def switched(on):
+    def switch(on):
         monkeypatch.setattr(plan, "rounds_up", lambda device: on)
 
-    return switched
+    return switch
 
 
 def test_size_classes_add_an_eighth_at_most_and_are_few():
@@ -124,12 +124,12 @@ def test_a_pixel_without_a_finite_depth_is_transparent(rounding):
     model, batch = make_model("model=hull").eval(), stack(list(hard_subjects().values())[:2])
     head = model.depth_head.forward
 
-    def spoiled(*inputs):
+    def spoil(*inputs):
         maps = head(*inputs)
         maps.valid[0, 0, 28] = False
         return maps
 
-    model.depth_head.forward = spoiled
+    model.depth_head.forward = spoil
     missing = int(batch.masks[0, 0, 28].sum())
     rounding(False)
     exact = predict(model, batch).gaussians

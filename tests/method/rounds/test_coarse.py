@@ -32,7 +32,7 @@ def recurrent(height, *overrides):
     return model
 
 
-def stacked(*batches):
+def stack_batches(*batches):
     """The elements of several batches in one, without depths."""
     matrices = {
         name: torch.cat([getattr(batch.cameras, name) for batch in batches])
@@ -46,7 +46,7 @@ def stacked(*batches):
 def test_the_height_of_each_subject_decides():
     """Its tallest or widest view in pixels decides; sides of copies are whole patches."""
     tall, small = make_batch(1, 3, SIDE, SIDE), make_batch(1, 3, SIDE, SIDE, zoom=0.3)
-    pair = stacked(tall, small)
+    pair = stack_batches(tall, small)
     rows = tall.masks[0].any(-1).sum(-1).max().item()
     expected = round(SIDE * HEIGHT / rows / 14) * 14
     assert coarse_sizes(pair, HEIGHT, 14) == [(expected, expected), None]
@@ -202,7 +202,7 @@ def test_elements_with_and_without_a_copy_do_not_touch_one_another(pad):
     batches = [in_dtype(dataclasses.replace(batch, depths=None), torch.float64) for batch in batches]
     model = recurrent(HEIGHT, f"model.pad={pad}").double()
     with torch.no_grad():
-        together = predict(model, stacked(*batches))
+        together = predict(model, stack_batches(*batches))
         for element, batch in enumerate(batches):
             alone = predict(model, batch)
             close(together.gaussians[element], alone.gaussians, 1e-7)

@@ -23,7 +23,7 @@ def halves(points):
     return torch.where(points[..., 2:] > CENTER[2], 0.46, 0.4).expand(points.shape)
 
 
-def painted(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
+def painted_batch(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
     """A surface whose colour depends on the position in the world, so that all views agree."""
     batch = make_batch(batch, views, spread=spread)
     masks, depths = ellipsoid(batch.cameras, radii=radii)
@@ -36,7 +36,7 @@ def seen_with(batch, gains):
     return dataclasses.replace(batch, images=batch.images * torch.as_tensor(gains)[..., None, None].float())
 
 
-def drawn(batch, seed=0, stops=0.5):
+def sample_gains(batch, seed=0, stops=0.5):
     rng = np.random.default_rng(seed)
     return np.stack([sample_color_gains(batch.masks.shape[1], stops, stops / 2, rng) for _ in batch.masks])
 
@@ -44,8 +44,8 @@ def drawn(batch, seed=0, stops=0.5):
 @pytest.mark.parametrize("seed", range(3))
 def test_gains_are_found(seed):
     """Half a stop between cameras is found to 3 %, and corrected images agree."""
-    batch = painted(2)
-    gains = drawn(batch, seed)
+    batch = painted_batch(2)
+    gains = sample_gains(batch, seed)
     dark = seen_with(batch, gains)
     found = log_gains(surface_splats(dark), dark)
     assert np.abs(np.log(gains)).max() > 0.1
@@ -58,15 +58,15 @@ def test_gains_are_found(seed):
 
 def test_differences_below_the_error_of_the_estimate_are_left():
     """Half a percent between cameras may as well be an error of depths."""
-    batch = painted()
-    found = log_gains(surface_splats(batch), seen_with(batch, np.exp(drawn(batch, stops=0.02) - 1)))
+    batch = painted_batch()
+    found = log_gains(surface_splats(batch), seen_with(batch, np.exp(sample_gains(batch, stops=0.02) - 1)))
     assert 0 < found.abs().max() < 1e-3
 
 
 def test_highlights_do_not_decide():
     """In one camera, a third of the surface is twice as dark as in all others."""
-    batch = painted()
-    gains = drawn(batch)
+    batch = painted_batch()
+    gains = sample_gains(batch)
     dark = seen_with(batch, gains)
     images = dark.images.clone()
     first, last = dark.masks[0, 0].nonzero()[:, 1].float().quantile(torch.tensor([0.3, 0.6])).int()
@@ -77,8 +77,8 @@ def test_highlights_do_not_decide():
 
 def test_what_a_view_does_not_see_does_not_count():
     """Cameras all around a surface that is slightly darker in front than behind."""
-    batch = painted(views=6, spread=360.0, paint=halves)
-    gains = drawn(batch)
+    batch = painted_batch(views=6, spread=360.0, paint=halves)
+    gains = sample_gains(batch)
     dark = seen_with(batch, gains)
     np.testing.assert_allclose(log_gains(surface_splats(dark), dark), np.log(gains), atol=0.02)
 
@@ -86,10 +86,10 @@ def test_what_a_view_does_not_see_does_not_count():
 def test_dark_rims_do_not_count():
     """Half-covered pixels at the outline of a narrow board are darker in one view than their matte
     implies."""
-    sharp = painted(views=3, spread=20.0, radii=torch.tensor([0.1, 0.8, 0.01]))
+    sharp = painted_batch(views=3, spread=20.0, radii=torch.tensor([0.1, 0.8, 0.01]))
     soft = with_soft_rims(sharp)
     soft = dataclasses.replace(soft, images=sharp.images * soft.alpha[:, :, None])
-    gains = drawn(soft)
+    gains = sample_gains(soft)
     dark = seen_with(soft, gains)
     images = dark.images.clone()
     images[:, 0] *= torch.where(dark.alpha[:, 0] < 0.9, 0.8, 1.0)[:, None]
@@ -101,8 +101,8 @@ def test_dark_rims_do_not_count():
 def test_colours_without_a_ratio_do_not_count(kind):
     """Clipped highlights, and shadows at a sensor's black level, cover most of the surface."""
     value = {"white": 0.97, "black": 0.01}[kind]
-    batch = painted(paint=lambda p: torch.where(p[..., 1:2] > 1.1, 0.4, value).expand(p.shape))
-    gains = drawn(batch)
+    batch = painted_batch(paint=lambda p: torch.where(p[..., 1:2] > 1.1, 0.4, value).expand(p.shape))
+    gains = sample_gains(batch)
     dark = seen_with(batch, gains)
     level = torch.tensor([0.0025 * (kind == "black"), 0, 0, 0])[:, None, None, None]
     images = (dark.images + level).clamp(max=1) * batch.masks[:, :, None]
@@ -111,8 +111,8 @@ def test_colours_without_a_ratio_do_not_count(kind):
 
 
 def test_batch_mates_change_nothing():
-    both = painted(2)
-    dark = seen_with(both, drawn(both))
+    both = painted_batch(2)
+    dark = seen_with(both, sample_gains(both))
     together = log_gains(surface_splats(dark), dark)
     for b in range(2):
         parts = {name: getattr(dark, name)[[b]] for name in ("images", "masks", "cameras", "depths")}
@@ -125,7 +125,7 @@ def test_batch_mates_change_nothing():
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_photographs_that_say_nothing_have_no_gains(value):
     """Entirely black or white images, and no Gaussians at all."""
-    batch = painted()
+    batch = painted_batch()
     flat = dataclasses.replace(batch, images=torch.full_like(batch.images, value))
     assert not log_gains(surface_splats(flat), flat).any()
     nothing = surface_splats(batch).select(slice(0, 0), (0,))
@@ -134,8 +134,8 @@ def test_photographs_that_say_nothing_have_no_gains(value):
 
 def test_the_model_equalizes_before_its_rounds():
     """The Gaussians' colours are those of the corrected images; without the option they are not."""
-    batch = painted()
-    dark = seen_with(batch, drawn(batch))
+    batch = painted_batch()
+    dark = seen_with(batch, sample_gains(batch))
     models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]
     models[1].keeps_drafts = True
     with torch.no_grad():
@@ -149,8 +149,8 @@ def test_the_model_equalizes_before_its_rounds():
 
 def test_photographs_that_are_divided_already_are_not_equalized_again():
     """The prediction equals, bit for bit, that of a model without the option, also for a subset of views."""
-    batch = painted()
-    dark, logs = seen_with(batch, drawn(batch)), torch.zeros(1, 4, 3)
+    batch = painted_batch()
+    dark, logs = seen_with(batch, sample_gains(batch)), torch.zeros(1, 4, 3)
     logs[0, 1], logs[0, 3] = 0.1, -2.0
     known = divide_by_gains(dark, logs)
     torch.testing.assert_close(known.images[0, 1], dark.images[0, 1] * math.exp(-0.1))
@@ -173,8 +173,8 @@ def test_photographs_that_are_divided_already_are_not_equalized_again():
 @pytest.mark.parametrize("view", range(4))
 def test_the_gamma_of_each_camera_is_found(view, gamma):
     """In all channels and at any exposure; the others have none."""
-    batch = painted(2)
-    gains = drawn(batch)
+    batch = painted_batch(2)
+    gains = sample_gains(batch)
     images = (0.6 * batch.images * torch.as_tensor(gains)[..., None, None].float()).clone()
     images[1, view] **= gamma
     wrong = dataclasses.replace(batch, images=images)
