@@ -29,28 +29,28 @@ from ghgs_lit.data.mask_checks import find_mask_problem
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.runtime.cores import allowed_cores
 
-if TYPE_CHECKING:  # photographs are read while PyTorch is imported
+if TYPE_CHECKING:  # PyTorch is imported while photographs are decoded
     import torch
 
-MIN_PHOTOGRAPHS = 3  #: Photographs that an instant needs where others of its are missing
+MIN_PHOTOGRAPHS = 3  #: Minimum number of photographs of an instant that lacks others
 
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """``folder.photographs(instant)`` for each of ``folder.instants``.
+    """A user's photographs with their calibration: ``photographs(instant)`` for each of ``instants``.
 
     Args:
-        images: folder of photographs named after their cameras; of such folders, one for each
-            instant; or of videos named after their cameras.
+        images: folder of photographs or videos named after their cameras, or of one such folder of
+            photographs for each instant.
         cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`.
-        masks: folder of masks, laid out and named as the photographs; None: the first there is of
-            ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or
-            named by the calibration, alpha.
+        masks: folder of masks, organised and named like the photographs; None: the first available
+            source of ``backgrounds``, ``segment``, masks next to the photographs (``<name>_mask.png``),
+            masks that the calibration names, alpha.
         backgrounds: folder of photographs without the subject, named after the cameras.
         segment: a segmenter of :data:`ghgs_capture.masks.SEGMENTERS`.
-        calibration: what the file does not say, or says wrongly
+        calibration: corrections of what the file omits or states wrongly
             (:class:`ghgs_lit.config.nodes.Calibration`).
-        sequence: which instants count, and how videos fit together
+        sequence: instants to use, and how videos are synchronised
             (:class:`ghgs_lit.config.nodes.SequenceOptions`).
 
     Raises:
@@ -64,7 +64,7 @@ class CaptureFolder:
     segment: str | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
     sequence: Mapping[str, Any] = field(default_factory=dict)
-    #: The views of one instant that are decoded, or are being decoded.
+    #: Views of one instant that are decoded or being decoded
     _begun: dict[str, dict[str, Future]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -76,17 +76,17 @@ class CaptureFolder:
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
             require(path is None or path.is_dir(), name, "a folder", str(path))
-        # reads the calibration and lists the photographs: missing files are refused here
+        # reads the calibration and lists the photographs, which raises for missing files
         _ = self.paths
 
     @functools.cached_property
     def file(self) -> CameraFile:
-        """The cameras as stored."""
+        """Cameras as stored in the file."""
         return read_cameras(self.cameras, self.calibration.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
-        """Meaning of the stored numbers: the format's, unless the user says otherwise."""
+        """Convention of the stored numbers: the format's, with the user's corrections."""
         return self.file.convention.with_options(vars(self.calibration))
 
     @functools.cached_property
@@ -113,8 +113,7 @@ class CaptureFolder:
 
     @functools.cached_property
     def missing(self) -> dict[str, dict[str, str]]:
-        """``{instant: {camera: why}}`` of photographs that are missing,
-        or could not be read so far."""
+        """``{instant: {camera: why}}`` of photographs that are missing or could not be read so far."""
         cameras = dict.fromkeys(itertools.chain.from_iterable(self._all_paths.values()))
         missing = {}
         for instant, paths in self.paths.items():
@@ -128,8 +127,8 @@ class CaptureFolder:
 
     @property
     def input_files(self) -> list[Path]:
-        """All files that may be read: photographs and what lies beside them, the calibration,
-        masks."""
+        """All possible input files: photographs and other files in their folders, calibration, masks,
+        backgrounds."""
         folders = set()
         for paths in self.paths.values():
             folders |= {path.parent if isinstance(path, Path) else self.images for path in paths.values()}
@@ -140,16 +139,16 @@ class CaptureFolder:
         return files
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
-        """Decode one instant, and apply the calibration.
+        """Decode one instant and apply the calibration.
 
         Args:
             instant: one of :attr:`instants`.
 
         Returns:
-            Its photographs, two or more, undistorted and upright.
+            At least two photographs, undistorted and upright.
 
         Raises:
-            InputError: as for :meth:`decode`; or a photograph has another aspect ratio than its
+            InputError: as for :meth:`decode`, or a photograph's aspect ratio differs from that of its
                 calibration.
         """
         views = self.decode(instant)
@@ -158,9 +157,9 @@ class CaptureFolder:
         return tuple(self._complete(instant, upright).values())
 
     def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
-        """Camera, photograph and matte as shown of each view, before the calibration is applied.
+        """Decode the views of one instant, as shown, before the calibration is applied.
 
-        They are kept until :meth:`photographs` has them, or another instant is decoded.
+        They are cached until the next call of :meth:`photographs`, or until another instant is decoded.
 
         Args:
             instant: one of :attr:`instants`.
@@ -169,15 +168,14 @@ class CaptureFolder:
             ``{camera: (camera, photograph, matte [h, w] uint8)}``.
 
         Raises:
-            InputError: a photograph or mask is missing or wrong; of several instants one may lack
-                photographs (:attr:`missing`) where three or more remain.
+            InputError: a photograph or mask is missing or invalid; in a sequence, an instant may lack
+                photographs (:attr:`missing`) if at least ``MIN_PHOTOGRAPHS`` remain.
         """
         self.begin(instant)
         return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
 
     def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-        """The values of all views; in a sequence,
-        without those that fail where the others are enough."""
+        """Values of all views; in a sequence, views that fail are left out if enough others remain."""
         values = {}
         for name, view in views.items():
             try:
@@ -194,15 +192,15 @@ class CaptureFolder:
         return values
 
     def begin(self, instant: str) -> None:
-        """Decode the views of an instant in threads; :meth:`decode` waits for them.
+        """Decode the views of an instant in background threads; :meth:`decode` waits for them.
 
         Args:
-            instant: one of :attr:`instants`; what is kept of another is forgotten.
+            instant: one of :attr:`instants`; cached views of another are discarded.
         """
         if instant in self._begun:
             return
         self._begun.clear()
-        # Segmentation has threads of its own, and one session.
+        # Segmentation uses its own threads, and one session.
         pool = ThreadPoolExecutor(allowed_cores() if self.segment is None else 1)
         self._begun[instant] = {
             name: pool.submit(self._view, name, path) for name, path in self.paths[instant].items()
@@ -210,7 +208,7 @@ class CaptureFolder:
         pool.shutdown(wait=False)
 
     def _view(self, name: str, path: Source) -> tuple[StoredCamera, Pixels, np.ndarray]:
-        """Decode one view. InputError: its photograph or mask is missing or wrong."""
+        """Decode one view; raises InputError if its photograph or mask is missing or invalid."""
         camera = self.file.cameras[name]
         pixels = read_pixels(path) if isinstance(path, Path) else path.pixels()
         matte = self._matte(name, camera, path, pixels)
@@ -221,28 +219,25 @@ class CaptureFolder:
         return camera, pixels, matte
 
     def _mask(self, path: Source) -> Source | None:
-        """The file of a photograph's mask, in its own folder or beside it; None: there is none."""
+        """Mask file of a photograph, in the folder of masks or next to the photograph, or None."""
         masks = self.images if self.masks is None else self.masks
         return mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
-        """One view, undistorted and upright, with the camera that a convention gives it.
+        """Undistort one view and turn it upright, with its camera converted by a convention.
 
         Args:
-            name: of the camera.
-            camera: as its file stores it.
+            name: name of the camera.
+            camera: the camera as stored in its file.
             pixels: the photograph as shown.
-            matte: of the photograph as shown, [h, w] uint8.
-            convention: meaning of the camera's numbers.
-
-        Returns:
-            The photograph.
+            matte: [h, w] uint8, of the photograph as shown.
+            convention: convention of the camera's numbers.
 
         Raises:
-            InputError: its aspect ratio is not that of the calibration, or undistortion leaves
-                nothing of the subject.
+            InputError: the photograph's aspect ratio differs from that of the calibration, or
+                undistortion leaves nothing of the subject.
         """
         image = pixels.image
         turns = 0
@@ -255,7 +250,7 @@ class CaptureFolder:
         if calibration.distortion.any():
             from ghgs_lit.geometry.undistortion import undistort
 
-            # All that undistortion depends on, as the key of a cache that instants share.
+            # Everything that undistortion depends on, as the key of a cache for all instants.
             lens = tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
             image, matte = undistort(image, matte, _grid(*lens, *size))
             expected = "a lens distortion that leaves some of the subject"
@@ -267,21 +262,8 @@ class CaptureFolder:
         return Photograph(name, image, matte, upright.intrinsics, upright.extrinsics, upright.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
-        """The matte of a photograph, from the first source that there is.
-
-        Args:
-            name: of the camera.
-            camera: its file may name a mask.
-            path: where the photograph comes from.
-            pixels: the photograph as shown.
-
-        Returns:
-            [h, w] uint8 of the photograph as shown.
-
-        Raises:
-            InputError: there is no source, or the one that the user named has no file for this
-                photograph, or a wrong one.
-        """
+        """Matte [h, w] uint8 of a photograph as shown, from the first available source; raises InputError
+        if there is none, or if the user's source lacks this photograph."""
         mask = self._mask(path)
         if self.masks is not None:
             require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
@@ -310,19 +292,8 @@ _segmenter = functools.cache(segmenter)
 
 @functools.lru_cache(maxsize=16)
 def _grid(intrinsics: tuple, distortion: tuple, fisheye: bool, height: int, width: int) -> "torch.Tensor":
-    """The grid of :func:`ghgs_lit.geometry.undistortion.undistorting_grid`,
-    kept for further instants.
-
-    Args:
-        intrinsics: the nine numbers of the matrix, in pixels.
-        distortion: OpenCV's coefficients.
-        fisheye: whether they are of Kannala and Brandt's model.
-        height: of the photograph in pixels.
-        width: of the photograph in pixels.
-
-    Returns:
-        Where each pixel of the undistorted photograph lies in the given one.
-    """
+    """Cached :func:`ghgs_lit.geometry.undistortion.undistorting_grid`; ``intrinsics`` are the nine numbers
+    of the matrix, in pixels."""
     from ghgs_lit.geometry.undistortion import undistorting_grid
 
     return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

@@ -1,8 +1,7 @@
-"""The instants of a sequence as data to learn from: of its cameras all but one are inputs,
-one is the target.
+"""Data set of the instants of a sequence: one camera is the target, the others are inputs.
 
-Each camera is the target in turn. Masks and cameras are those that a prediction of the sequence
-would have; instants with a mask that still fails are left out."""
+Each camera is the target in turn. Masks and cameras are those that a prediction of the sequence would use;
+instants with a mask that still fails are left out."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -23,22 +22,22 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.parsing import read_json
 
 LISTING = "instants.json"  #: Names of the instants of each phase; written last
-#: One instant in so many, three at most, is only measured.
+#: One in this many instants, three at most, is held out for validation
 _EVERY = 5
 _MOST_MEASURED = 3
 
 
 def splits_of(names: Sequence[str]) -> dict[str, list[str]]:
-    """Which instants are learned from, and which are only measured.
+    """Split instants into training and validation.
 
     Args:
-        names: of two instants or more, in their order.
+        names: names of at least two instants, in their order.
 
     Returns:
         Names by phase, ``train`` and ``val``.
 
     Raises:
-        InputError: there are fewer.
+        InputError: there are fewer than two.
     """
     require(len(names) > 1, "images", "two instants or more to learn from, whose masks agree", len(names))
     count = min(max(len(names) // _EVERY, 1), _MOST_MEASURED)
@@ -47,21 +46,17 @@ def splits_of(names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def agrees(capture: Capture) -> bool:
-    """Whether an instant can be learned from: none of its masks fails where its view is left out.
-
-    Args:
-        capture: of an instant.
-    """
+    """Whether an instant is fit for training: each of its masks agrees with the others."""
     agreement = Agreement.of(capture)
     return agreement is None or not agreement.failed.any()
 
 
 def write_instant(capture: Capture, folder: Path, size: tuple[int, int]) -> None:
-    """Write the crops of an instant as they are learned from.
+    """Write the crops of an instant for training.
 
     Args:
-        capture: with corrected masks and cameras, and gains where they are known.
-        folder: of all instants; gets ``<name>.npz``.
+        capture: an instant with corrected masks and cameras, and gains if known.
+        folder: folder of all instants, to which ``<name>.npz`` is written.
         size: (height, width) of the crops in pixels.
     """
     batch = capture.batch(size, CORRECTION if doubt_of_masks(capture, size) else 0)
@@ -81,14 +76,14 @@ def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class InstantReader(Reader):
-    """Instants of a capture.
+    """Reader of a capture's instants.
 
-    In validation each camera of an instant is the target once: a subject ``<instant>/<camera>`` has
-    it at its last position.
+    In validation each camera of an instant is the target once: the subject ``<instant>/<camera>`` has this
+    camera at its last position.
 
     Args:
-        folder: of the instants.
-        names: of those of the phase.
+        folder: folder of the instants.
+        names: names of the instants of the phase.
         cameras: names of the cameras, in the order of the crops.
         phase: ``train`` or ``val``.
     """
@@ -109,10 +104,10 @@ class InstantReader(Reader):
         """See :meth:`Reader.read_view`.
 
         Args:
-            name: of the subject.
-            position: number of the camera, from that of the subject on.
-            view: 0.
-            depth: no effect: depths are not known.
+            name: name of the subject.
+            position: index of the camera, starting at the first one of the subject.
+            view: always 0.
+            depth: ignored, since depths are unknown.
         """
         instant, first = self._first[name]
         stored = _stored(self._folder / f"{instant}.npz")
@@ -130,20 +125,19 @@ class InstantReader(Reader):
 
 @functools.lru_cache(maxsize=64)
 def _stored(path: Path) -> dict[str, np.ndarray]:
-    """The crops of an instant, kept for further photographs of it."""
+    """Crops of an instant, cached for its further views."""
     with np.load(path) as stored:
         return dict(stored)
 
 
 class Instants(DataOptions):
-    """The instants of a capture that ``ghgs adapt`` learns from,
-    each camera in turn the others' target."""
+    """Instants of a capture on which ``ghgs adapt`` trains; each camera in turn is the target."""
 
     static_cameras: ClassVar[bool] = True
     name: Text = "instants"
     size: Size = 252
     root: PathText | None = None
-    """Folder of the instants, which the verb writes."""
+    """Folder of the instants, written by ``ghgs adapt``."""
     cameras: tuple[Text, ...] = ()
     """Names of the cameras, in their order."""
 

@@ -1,8 +1,7 @@
-"""The subject's matte in a photograph: from a file, alpha, a photograph of the background,
-or rembg.
+"""Mattes of the subject in photographs, from a file, alpha, a photograph of the background, or rembg.
 
-A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject;
-a mask has only 0 and 255.
+A matte [h, w] uint8 is 255 times the share of each pixel that the subject covers; a mask contains only 0
+and 255.
 """
 
 import os
@@ -18,28 +17,28 @@ from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import import_optional, require, require_choice
 
 SEGMENTERS = ("rembg",)  #: Choices of ``segment``
-_LABELS = 32  # Labels of body parts are numbers below this; alpha and probabilities reach 255
-# By how many deviations of the noise a pixel differs from the background, and by how much at least.
+_LABELS = 32  # Labels of body parts are below this; alpha and probabilities reach 255
+# Least difference of a pixel from the background: in standard deviations of the noise, and in levels
 _DEVIATIONS = 6.0
 _LEAST_DIFFERENCE = 12.0
-_SPECK = 0.05  # Regions below this share of the largest one's area are not of the subject
+_SPECK = 0.05  # Regions below this share of the largest one's area are discarded
 
 
 def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
-    """The matte of a photograph from alpha, labels, or grey of 8 or 16 bits.
+    """Read a matte from an image: its alpha, labels, or grey values of 8 or 16 bits.
 
-    An alpha channel counts unless it is constant. All labels but 0 are the subject; a single larger
-    number beside them is void. A mask of another size is scaled.
+    An alpha channel is used unless it is constant. All labels except 0 are the subject; a single larger
+    value in addition to labels is void. A mask of another size is scaled.
 
     Args:
-        path: of the mask.
-        pixels: the photograph as shown; the mask fits it as shown or as stored.
+        path: the mask file.
+        pixels: the photograph; the mask fits it as shown or as stored.
 
     Returns:
-        [h, w] uint8 of the photograph as shown.
+        [h, w] uint8, for the photograph as shown.
 
     Raises:
-        InputError: the mask cannot be decoded, or fits the photograph neither as shown nor stored.
+        InputError: the mask cannot be decoded, or fits the photograph neither as shown nor as stored.
     """
     image = read_image(path)
     values = np.asarray(image)
@@ -50,7 +49,7 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     values = values if values.ndim == 2 else values.max(-1)
     most = int(values.max(initial=0))
     labelled = (values > 0) & (values < _LABELS)
-    # Void is a thin rim, and a soft matte has numbers between it and the labels.
+    # Void is a thin rim; a soft matte has values between the labels and the largest value.
     is_void = (values == most).sum() < labelled.sum() and not ((values >= _LABELS) & (values < most)).any()
     if most < _LABELS or is_void:
         return fitted(labelled * np.uint8(255), pixels, path)
@@ -58,18 +57,18 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def fitted(matte: np.ndarray, pixels: Pixels, path: Path) -> np.ndarray:
-    """A matte turned and scaled to its photograph.
+    """Rotate and scale a matte to its photograph.
 
     Args:
-        matte: [h, w] uint8, of the photograph as shown or as stored, at any size.
+        matte: [h, w] uint8, for the photograph as shown or as stored, at any size.
         pixels: the photograph as shown.
-        path: of the matte, for the message.
+        path: file of the matte, for the message.
 
     Returns:
-        [h, w] uint8 of the photograph as shown.
+        [h, w] uint8, for the photograph as shown.
 
     Raises:
-        InputError: its aspect ratio is not that of the photograph.
+        InputError: the aspect ratio differs from that of the photograph.
     """
     sizes = (pixels.size, pixels.stored_size)
     alike = [size for size in sizes if size == matte.shape] or [
@@ -84,25 +83,25 @@ def fitted(matte: np.ndarray, pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask of what differs from a background.
+    """Segment what differs from a photograph of the background.
 
     Args:
         pixels: the photograph with the subject.
-        path: of a photograph of the same camera without the subject.
+        path: a photograph by the same camera without the subject.
 
     Returns:
-        [h, w] uint8, 0 or 255; without specks and holes.
+        [h, w] uint8, 0 or 255, without specks and holes.
 
     Raises:
         InputError: the background has another size, or nothing differs.
     """
-    from scipy import ndimage  # here: masks of files do not need it
+    from scipy import ndimage  # here: not needed for masks from files
 
     background = read_pixels(path)
     fits = background.size == pixels.size
     require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)
     difference = np.abs(pixels.image.astype(np.float32) - background.image).max(-1)
-    # Most pixels show the background: 1.48 times the median is a deviation of the noise.
+    # Most pixels show the background: 1.48 times the median estimates the noise's standard deviation.
     threshold = max(_DEVIATIONS * 1.4826 * float(np.median(difference)), _LEAST_DIFFERENCE)
     radius = max(max(pixels.size) // 400, 1)
     regions, count = ndimage.label(ndimage.binary_opening(difference > threshold, iterations=radius))
@@ -116,13 +115,13 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from photographs to mattes, which keeps its network loaded.
+    """Create a segmenter, which keeps its network loaded.
 
     Args:
         name: one of :data:`SEGMENTERS`.
 
     Returns:
-        The function; its mattes are [h, w] uint8.
+        A function from photographs to mattes [h, w] uint8.
 
     Raises:
         InputError: the name is unknown, or the package is not installed.
@@ -139,7 +138,7 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
 
 
 def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
-    """Find the mask of a photograph: in the same place below ``masks``, or marked beside it.
+    """Find the mask of a photograph: at the same relative path in ``masks``, or named ``<name>_mask``.
 
     Args:
         photograph: a path below ``images``.
@@ -147,12 +146,12 @@ def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
         masks: folder of the masks; may be ``images``.
 
     Returns:
-        The path; None: there is no mask.
+        The path, or None.
     """
     # Not resolved: photographs may be links to files elsewhere.
     folder = masks / photograph.parent.relative_to(images)
     marked = f"{photograph.stem}{MASK_ENDING}"
-    # Beside the photograph, the image of its name is the photograph itself.
+    # In the photograph's folder, the image of the same name is the photograph itself.
     is_same_folder = os.path.realpath(folder) == os.path.realpath(photograph.parent)
     # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
     names = [marked] if is_same_folder else [photograph.stem, photograph.name, marked]

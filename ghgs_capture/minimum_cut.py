@@ -1,22 +1,22 @@
-"""Binary labels of pixels with the least energy, by a minimum cut (Boykov and Jolly, ICCV 2001)."""
+"""Binary segmentation with minimal energy, by a minimum cut (Boykov and Jolly, ICCV 2001)."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-#: Steps to a pixel's neighbours; the other four are those of the neighbours.
+#: Steps to four of a pixel's eight neighbours; the others are covered from those neighbours
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
-_UNITS = 32  #: Capacities are whole numbers: units of an energy of 1
+_UNITS = 32  #: Integer capacity units per unit of energy
 _MOST = 1 << 20  #: Largest capacity in units, so that no sum overflows
 
 
 def neighbour_pairs(values: np.ndarray, step: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Values at both ends of each pair of neighbours.
+    """Values at both pixels of each pair of neighbours.
 
     Args:
-        values: of pixels [h, w, ...].
-        step: rows (0 or more) and columns from the first to the second, of :data:`NEIGHBOURS`.
+        values: [h, w, ...].
+        step: (rows, columns) from the first to the second pixel, of :data:`NEIGHBOURS`.
 
     Returns:
         Views of the values at the first and at the second pixels.
@@ -31,17 +31,17 @@ def neighbour_pairs(values: np.ndarray, step: tuple[int, int]) -> tuple[np.ndarr
 def minimum_cut(
     evidence: Float[np.ndarray, "h w"], costs: list[Float[np.ndarray, "..."]]
 ) -> Bool[np.ndarray, "h w"]:
-    """Choose the pixels whose sum of evidence, less the costs of pairs that are cut, is greatest.
+    """Select the pixels that maximise the sum of evidence minus the costs of cut pairs.
 
-    A pixel whose evidence exceeds what all of its pairs cost is decided by it,
-    and is no node of the graph.
+    A pixel whose evidence exceeds the total cost of its pairs is decided by its evidence and is not a node
+    of the graph.
 
     Args:
-        evidence: for each pixel, above 0 for the subject; without unit.
-        costs: of neighbours with different labels, 0 or more, for each step of :data:`NEIGHBOURS`.
+        evidence: evidence of each pixel, positive for the subject; dimensionless.
+        costs: costs of different labels of neighbours, 0 or more, for each step of :data:`NEIGHBOURS`.
 
     Returns:
-        Which pixels are chosen.
+        True for selected pixels.
     """
     index = np.arange(evidence.size).reshape(evidence.shape)
     ends = [neighbour_pairs(index, step) for step in NEIGHBOURS]
@@ -52,7 +52,7 @@ def minimum_cut(
     around = np.bincount(first, cost, evidence.size) + np.bincount(second, cost, evidence.size)
     chosen = evidence > 0
     is_open = np.abs(evidence) < around
-    # What a decided neighbour costs is evidence.
+    # The cost of a pair with a decided neighbour becomes evidence.
     for one, other in ((first, second), (second, first)):
         beside = is_open[one] & ~is_open[other]
         signed = np.where(chosen[other[beside]], cost[beside], -cost[beside])
@@ -67,18 +67,8 @@ def minimum_cut(
 def _cut(
     evidence: np.ndarray, first: np.ndarray, second: np.ndarray, cost: np.ndarray, count: int
 ) -> np.ndarray:
-    """The side of the source of a graph with two terminals.
-
-    Args:
-        evidence: of each of the nodes.
-        first: a node of each edge.
-        second: the other.
-        cost: of each edge.
-        count: of nodes.
-
-    Returns:
-        Which nodes are on that side [count].
-    """
+    """Nodes [count] on the source's side of the minimum cut; ``first`` and ``second`` are the ends of each
+    edge."""
     source, sink = count, count + 1
     nodes = np.arange(count)
     starts = np.concatenate((first, second, np.full(count, source), nodes))

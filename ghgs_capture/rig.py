@@ -1,7 +1,7 @@
-"""Cameras of a rig that stands still, corrected once over several instants, and their colour gains.
+"""Correct the cameras and colour gains of a static rig jointly over several instants.
 
-One instant shows one pose, often with a mask that is wrong somewhere; several say more about the
-cameras, and cameras that are the same in all instants do not flicker."""
+A single instant shows one pose, often with a mask error; several instants constrain the cameras better, and
+cameras that are constant over a sequence do not flicker."""
 
 import itertools
 import math
@@ -26,49 +26,38 @@ from ghgs_lit.refinement import CameraRefinement, pixels_moved
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras
 
-INSTANTS = 8  #: Instants, spread over a sequence, for correcting its cameras
+INSTANTS = 8  #: Number of instants, spread over a sequence, for correcting its cameras
 #: Median deviation of log gains above which exposures change between instants.
 _CHANGING = 0.05
 
 
 def spread(values: Sequence[Any], count: int) -> list[Any]:
-    """Some of a sequence's instants, evenly spread from the first to the last.
-
-    Args:
-        values: one for each instant.
-        count: how many at most, 2 or more.
-
-    Returns:
-        The values of these instants, in their order.
-    """
+    """Select up to ``count`` (2 or more) values, evenly spread from the first to the last."""
     places = [round((len(values) - 1) * i / (count - 1)) for i in range(count)]
     return [values[place] for place in dict.fromkeys(places)] if len(values) else []
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Corrected cameras, and colour gains where found, by name."""
+    """Corrected cameras, and colour gains if found, by name."""
 
     extrinsics: Mapping[str, np.ndarray]  #: [4, 4] float64, world to camera
-    zoom: Mapping[str, float]  #: factor of their focal lengths
-    moved: Mapping[str, float]  #: pixels of a crop that the correction moved the subject by
-    why: str = ""  #: what the given cameras contradicted, where ``auto`` decided
+    zoom: Mapping[str, float]  #: factor of the focal lengths
+    moved: Mapping[str, float]  #: pixels of a crop by which the correction moved the subject
+    why: str = ""  #: reason of the correction if ``auto`` chose it
     #: [3], with a geometric mean of 1
     gains: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def applied(self, capture: Capture) -> Capture:
-        """Give a capture the corrected cameras.
+        """Replace the cameras of a capture by the corrected ones.
 
         Args:
-            capture: of this rig, with cameras as given.
-
-        Returns:
-            The capture; cameras that the rig lacks stay.
+            capture: capture of this rig with uncorrected cameras; those that the rig lacks are kept.
         """
         return replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
 
     def _corrected(self, photograph: Photograph) -> Photograph:
-        """A camera that most instants lack stays as it is."""
+        """Correct one camera; a camera that most instants lack is unchanged."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
         lens = photograph.intrinsics * self._zoom_of(photograph.name)
         gains = self.gains.get(photograph.name, photograph.gains)
@@ -80,11 +69,11 @@ class Rig:
     def calibrations(
         self, folder: CaptureFolder, captures: Sequence[Capture]
     ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
-        """The corrected cameras of a folder's photographs as they are stored.
+        """Corrected calibrations for a folder's photographs as stored.
 
         Args:
-            folder: where the captures come from.
-            captures: of the folder, with the cameras as given.
+            folder: folder of the captures.
+            captures: captures with uncorrected cameras.
 
         Returns:
             By camera, its calibration and the (height, width) of its photographs in pixels.
@@ -95,7 +84,7 @@ class Rig:
             stored = folder.file.cameras[name]
             size = stored.size or photograph.mask.shape
             given = calibrate(stored, folder.convention, size)
-            # The motion is the same before the photograph is turned upright.
+            # The correction does not depend on turning the photograph upright.
             corrected = self._corrected(photograph)
             moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
             lens = given.intrinsics * self._zoom_of(name)
@@ -113,19 +102,19 @@ def corrected_rig(
     refine_masks: int | Literal["auto"],
     renderer: Renderer,
 ) -> Rig | None:
-    """Correct the cameras of several instants together.
+    """Correct the cameras of a rig over several instants jointly.
 
     Args:
-        captures: of one rig; those that lack a camera take no part.
-        model: in evaluation mode, whose predictions the photographs are compared with.
+        captures: captures of one rig; only those with the most common set of cameras are used.
+        model: in evaluation mode; its predictions are compared with the photographs.
         size: (height, width) of the crops in pixels.
-        rounds: most rounds of :class:`ghgs_lit.refinement.CameraRefinement`; ``auto``: 4 where the
-            silhouettes of half of the instants contradict the cameras.
+        rounds: maximum number of rounds of :class:`ghgs_lit.refinement.CameraRefinement`; ``auto``: 4 if
+            the silhouettes of half of the instants contradict the cameras.
         refine_masks: as for :func:`ghgs_capture.prediction.predict`.
-        renderer: draws what is compared.
+        renderer: renders the comparisons.
 
     Returns:
-        The cameras with their gains; None: they stay as they are.
+        The cameras with their gains; None if they are unchanged.
     """
     names = Counter(_names(capture) for capture in captures).most_common(1)[0][0]
     captures = [capture for capture in captures if _names(capture) == names]
@@ -159,15 +148,15 @@ def corrected_rig(
 
 @torch.no_grad()
 def shared_gains(batch: Batch, model: Predictor) -> np.ndarray | None:
-    """Colour gains of cameras: the median over instants, with a geometric mean of 1 over cameras.
+    """Estimate colour gains of cameras: the median over instants, with geometric mean 1 over cameras.
 
     Args:
-        batch: an element for each instant, in the world.
+        batch: one element per instant, in the world.
         model: in evaluation mode.
 
     Returns:
-        [V, 3] from ``1 / MOST_GAIN`` to ``MOST_GAIN``; None: exposures change between instants,
-        photographs are divided by gains already, or the model uses none.
+        [V, 3] from ``1 / MOST_GAIN`` to ``MOST_GAIN``; None if exposures change between instants,
+        photographs are already divided by gains, or the model does not use gains.
     """
     rounds = model.model.rounds
     if isinstance(rounds, NoRounds) or not rounds.options.gains or batch.log_gains is not None:
@@ -187,7 +176,7 @@ def _names(capture: Capture) -> tuple[str, ...]:
 
 
 def _together(batches: Sequence[Batch]) -> Batch:
-    """One batch of batches of one element, with the same views."""
+    """Concatenate batches of one element with the same views."""
     parts = {}
     for name in ("images", "masks", "alpha", "log_gains"):
         if getattr(batches[0], name) is not None:

@@ -1,4 +1,4 @@
-"""Videos of cameras: when each frame was taken, and frames that ffmpeg decodes when asked for."""
+"""Read videos of cameras: the time of each frame, and frames decoded on demand by ffmpeg."""
 
 import functools
 import io
@@ -19,49 +19,49 @@ from ghgs_lit.errors import InputError, import_optional, require
 from ghgs_lit.parsing import require_file
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
-# ffmpeg says on stderr when each frame is shown, before it writes the frame.
+# Makes ffmpeg print the time of each frame to stderr before it writes the frame
 _TELL = r"metadata=add:key=k:value=v,metadata=print:file='pipe\:2':direct=1"
 _TIME = re.compile(rb"pts_time:(\S+)")
-# Exact colours: without it green is a level too dark.
+# Exact colours; by default green is one level too dark
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
-# How framecrc lists a packet that says no time, and one that is not shown.
+# How framecrc marks a packet without time, and one that is not shown
 _UNTIMED = -(2**63)
 _HIDDEN = re.compile("F=0x[4-7]")
-# Curves of colours that ffmpeg does not turn into those of photographs.
+# Transfer curves that ffmpeg does not convert to sRGB
 _HDR = re.compile(r"Video: .*\b(arib-std-b67|smpte2084)\b")
 _NAMES = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
-_PATIENCE = 10.0  #: Seconds of a video that are decoded to reach a frame; beyond, it is sought
+_PATIENCE = 10.0  #: Seconds of a video that are decoded to reach a frame; ffmpeg seeks frames beyond
 
 
 @dataclass(frozen=True)
 class Video:
-    """The frames of a video, as its file lists them."""
+    """The frames of a video, as listed in its file."""
 
     path: Path
     size: tuple[int, int]  #: (height, width) in pixels as shown
-    seconds: np.ndarray  #: [n] float64, when each frame is shown, ascending
-    numbers: np.ndarray  #: [n] int64, the number of each; dropped frames have numbers, too
-    hdr: str = ""  #: HLG or PQ, where colours follow their curve
+    seconds: np.ndarray  #: [n] float64, time of each frame, ascending
+    numbers: np.ndarray  #: [n] int64, number of each frame, counting dropped frames
+    hdr: str = ""  #: HLG or PQ if colours follow this curve
 
     @property
     def count(self) -> int:
-        """Number of frames, with those that the camera dropped."""
+        """Number of frames, including those that the camera dropped."""
         return int(self.numbers[-1]) + 1
 
     @property
     def rate(self) -> float:
-        """Frames a second; 1 where there is one frame."""
+        """Frames per second; 1 if there is only one frame."""
         length = max(float(self.seconds[-1] - self.seconds[0]), 1e-6)
         return (self.count - 1) / length if self.count > 1 else 1.0
 
     def number_at(self, seconds: float) -> int | None:
-        """The frame that is shown at a time.
+        """Number of the frame at a time.
 
         Args:
-            seconds: on the clock of :attr:`seconds`.
+            seconds: time on the clock of :attr:`seconds`.
 
         Returns:
-            Its number; None: there is none within half a frame.
+            The number; None without a frame within half a frame time.
         """
         away = np.abs(self.seconds - seconds)
         place = int(away.argmin())
@@ -69,17 +69,11 @@ class Video:
 
 
 def read_video(path: Path) -> Video:
-    """List the frames of a video; only the first is decoded.
-
-    Args:
-        path: of the file.
-
-    Returns:
-        When each frame is shown, and its number.
+    """List the frames of a video; only the first one is decoded.
 
     Raises:
-        InputError: the file is missing, ffmpeg cannot read it or is not installed, or there is no
-            frame.
+        InputError: the file is missing, cannot be read by ffmpeg or has no frames, or ffmpeg is not
+            installed.
     """
     require_file(path, "a video")
     return _read_video(path, path.stat().st_mtime_ns)
@@ -87,7 +81,7 @@ def read_video(path: Path) -> Video:
 
 @functools.lru_cache(maxsize=256)
 def _read_video(path: Path, changed: int) -> Video:
-    """:func:`read_video` of a file that has not ``changed`` since it was read."""
+    """:func:`read_video`, cached by the modification time ``changed``."""
     options = ("-frames:v", "1", "-f", "image2pipe", "-c:v", "pgm")
     first = subprocess.run(_command(path, "gray", *options, log="error"), capture_output=True)
     time = _TIME.search(first.stderr)
@@ -103,7 +97,7 @@ def _read_video(path: Path, changed: int) -> Video:
     unit = next(Fraction(line.split(":")[1].strip()) for line in listed if line.startswith("#tb"))
     is_timed = shown.min() > _UNTIMED
     seconds = np.sort(shown if is_timed else decoded) * float(unit)
-    if not is_timed:  # packets of AVI are in the order of decoding: frames follow later
+    if not is_timed:  # packets of AVI are in decoding order: frames are shown later
         seconds += float(time[1]) - seconds[0]
     steps = np.diff(seconds)
     usual = max(float(np.median(steps)), 1e-6) if len(steps) else 1.0
@@ -124,12 +118,12 @@ def _command(path: Path, pixels: str, *output: str, select: str = "1", **source:
 
 
 class Reader:
-    """Frames of one video, decoded in order; elsewhere it is sought.
+    """Decoder of one video's frames, fastest in ascending order; other frames require a seek.
 
     Args:
-        video: as :func:`read_video` lists it.
-        pixels: ``rgb24`` | ``gray``.
-        step: distance of the frames that will be asked for; ffmpeg drops the others.
+        video: the video from :func:`read_video`.
+        pixels: pixel format: ``rgb24`` | ``gray``.
+        step: distance between requested frames; ffmpeg drops the others.
     """
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
@@ -138,8 +132,7 @@ class Reader:
         self.step = step
         self._lock = threading.Lock()
         self._process = None
-        # The numbers of the frame at hand and of the one before:
-        # no frame between them could be decoded.
+        # Numbers of the current frame and of the previous one; no frame between them can be decoded.
         self._at = self._before = -1
         self._frame = np.zeros(0, np.uint8)
 
@@ -147,13 +140,13 @@ class Reader:
         """Decode a frame.
 
         Args:
-            number: of the frame, counted with dropped ones.
+            number: number of the frame, counting dropped frames.
 
         Returns:
             [h, w, 3] or, with ``gray``, [h, w] uint8; read-only.
 
         Raises:
-            InputError: no frame of this number can be decoded.
+            InputError: there is no such frame, or it cannot be decoded.
         """
         far = _PATIENCE * self.video.rate + self.step
         with self._lock:
@@ -166,7 +159,7 @@ class Reader:
             return self._frame
 
     def _open(self, number: int) -> None:
-        """Start ffmpeg a second before a frame."""
+        """Start ffmpeg one second before a frame."""
         video = self.video
         select = "1"
         place = min(np.searchsorted(video.numbers, number), len(video.numbers) - 1)
@@ -184,7 +177,7 @@ class Reader:
         self._at = self._before = number - 1
 
     def _advance(self) -> bool:
-        """Take the next frame of ffmpeg; false: there is none."""
+        """Read the next frame from ffmpeg; false at the end."""
         shape = (*self.video.size, 3) if self.pixels == "rgb24" else self.video.size
         time = next(filter(None, map(_TIME.search, self._process.stderr)), None)
         content = self._process.stdout.read(math.prod(shape))
