@@ -1,4 +1,4 @@
-"""Frames of a folder with one video for each camera, by instant."""
+"""Group the frames of a folder with one video per camera by instant."""
 
 import os
 import warnings
@@ -26,7 +26,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import normalize_name, read_rows
 from ghgs_lit.runtime.cores import allowed_cores
 
-# Coding changes black and white by less than this.
+# Video coding changes black and white by less than this
 _CODED = 16
 _DIGITS = 6
 _TO_SRGB = "zscale=t=linear:npl={},format=gbrpf32le,zscale=p=bt709:t=iec61966-2-1:m=bt709:r=tv,format=yuv420p"
@@ -34,8 +34,7 @@ _TO_SRGB = "zscale=t=linear:npl={},format=gbrpf32le,zscale=p=bt709:t=iec61966-2-
 
 @dataclass(frozen=True, slots=True)
 class VideoFrame:
-    """A photograph, or a mask, that is a frame of a video;
-    ``mask``: that of the photograph, where known."""
+    """A video frame that is a photograph, with its ``mask`` if known, or a mask."""
 
     video: Reader
     number: int
@@ -45,24 +44,24 @@ class VideoFrame:
         return f"{self.video.video.path}, frame {self.number}"
 
     def pixels(self) -> Pixels:
-        """The photograph.
+        """Decode the frame as a photograph.
 
         Raises:
-            InputError: it cannot be decoded.
+            InputError: the frame cannot be decoded.
         """
         return Pixels(self.video.frame(self.number), None, 0)
 
     def matte(self, pixels: Pixels) -> np.ndarray:
-        """The mask of a photograph.
+        """Decode the frame as the mask of a photograph.
 
         Args:
-            pixels: the photograph that the mask is of.
+            pixels: the photograph.
 
         Returns:
-            [h, w] uint8; black and white are exact, though coding changes them.
+            [h, w] uint8; black and white are exact, although video coding changes them.
 
         Raises:
-            InputError: it cannot be decoded, or has another size.
+            InputError: the frame cannot be decoded, or has another aspect ratio.
         """
         grey = self.video.frame(self.number)
         exact = np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
@@ -73,12 +72,12 @@ Source = Path | VideoFrame  #: Where a photograph comes from
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
-    """Whether a folder without photographs has a camera's video, or videos and no folders.
+    """Whether a folder without photographs contains a camera's video, or videos and no folders.
 
     Args:
-        folder: where they may lie.
-        cameras: by name.
-        names: cameras of photographs of other names.
+        folder: the folder.
+        cameras: cameras by name.
+        names: cameras of videos with other names.
     """
     if not folder.is_dir() or images_in(folder):
         return False
@@ -96,22 +95,22 @@ def find_frames(
     sync: Mapping[str, int] | str | None,
     step: int,
 ) -> dict[str, dict[str, VideoFrame]]:
-    """The frames of each instant that all videos show; a warning says where others are left over.
+    """Find the frames of each instant that all videos show; warns if the videos differ in length.
 
     Args:
-        folder: of videos, each named after its camera.
-        masks: folder of masks: for each video one of the same name, or a folder of numbered images;
-            None: videos beside the others that end with ``_mask``, if any.
-        cameras: by name.
-        names: cameras of videos of other names.
-        convention: meaning of the cameras' numbers, to check the videos' sizes.
-        sync: frames by which a camera began before the others; or a CSV of
-            ``camera,frame,seconds``, by which each frame of the first camera gets the nearest one
-            of every other; None: all began together.
-        step: of the instants that will be read, 1 or more; with a CSV it is not used.
+        folder: folder of videos, each named after its camera.
+        masks: folder of masks, with a video or a folder of numbered images of the same name for each
+            video; None: videos in ``folder`` whose names end with ``_mask``, if any.
+        cameras: cameras by name.
+        names: cameras of videos with other names.
+        convention: convention of the cameras' numbers, for checking the sizes of videos.
+        sync: number of frames by which each camera started before the others; or path of a CSV
+            ``camera,frame,seconds``, with which each frame of the first camera is matched with the
+            nearest ones of the others; None: all started together.
+        step: step between the instants that will be read, 1 or more; ignored with a CSV.
 
     Returns:
-        ``{instant: {camera: frame}}``, instants named by the first camera's frame.
+        ``{instant: {camera: frame}}``, instants named after the first camera's frame number.
 
     Raises:
         InputError: videos do not fit the cameras or one another.
@@ -148,7 +147,7 @@ def find_frames(
 
 
 def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:
-    """The frame of each camera by the first camera's."""
+    """Frame number of each camera, by that of the first camera."""
     unknown = sorted(set(offsets) - set(videos))
     require(not unknown, "sequence.sync", f"cameras among {', '.join(videos)}", unknown)
     wrong = {name: value for name, value in offsets.items() if type(value) is not int}
@@ -170,9 +169,8 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
 
 
 def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
-    """The frame of each camera nearest to each of the first camera's,
-    within half of its frame time."""
-    import pandas as pd  # here: it takes time to import
+    """Frame of each camera that is nearest to each of the first camera's, within half a frame time."""
+    import pandas as pd  # here: slow to import
 
     columns = {"camera": str, "frame": int, "seconds": float}
     rows = read_rows(path)
@@ -204,21 +202,8 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
-    """The masks of a video by frame number.
-
-    Args:
-        video: of the photographs.
-        folder: of the videos.
-        masks: as for :func:`find_frames`.
-        step: as for :func:`find_frames`.
-
-    Returns:
-        Frames of a video of masks, or paths of images; empty if ``masks`` is None and there are
-        none beside it.
-
-    Raises:
-        InputError: ``masks`` has none of this video, or they are not numbered as its frames.
-    """
+    """Masks of a video by frame number, from a video of masks or numbered images; raises InputError if
+    ``masks`` is given and lacks them, or if they are not numbered like the frames."""
     name = normalize_name(video.path.stem)
     place = folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
@@ -228,7 +213,7 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict
         drawn = read_video(path)
         reader = Reader(drawn, "gray", step)
         numbers = drawn.numbers.tolist()
-        # Masks made frame by frame lack those that the camera dropped.
+        # Masks made frame by frame do not count the frames that the camera dropped.
         known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
         return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}
     if masks is None:
@@ -239,7 +224,7 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict
 
 
 def _numbered(folder: Path, video: Video) -> dict[int, Path]:
-    """Images by the number of their frame; programs count them from 0 or from 1."""
+    """Images by frame number, which programs count from 0 or from 1."""
     digits = {"".join(filter(str.isdigit, name)): path for name, path in images_in(folder).items()}
     numbered = {int(number): path for number, path in digits.items() if number}
     if len(numbered) == len(video.numbers):

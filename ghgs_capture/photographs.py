@@ -1,4 +1,4 @@
-"""Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
+"""Find and decode photographs in folders, and match them with cameras by name."""
 
 import functools
 import re
@@ -15,27 +15,27 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import find_path, normalize_name
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
-#: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.
+#: Suffixes of unsupported image formats, and of files that are never photographs
 PICTURES = "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
 _COMPANIONS = "json xml xmp txt toml yaml yml csv npy npz pkl aae md log ply obj"
-MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
-# The same with a number after it, or of a foreground.
+MASK_ENDING = "_mask"  #: Ending of the name of a mask next to its photograph
+# Also with a number, or "fmask" for foreground
 _MASK = re.compile(r"_f?mask_?\d*$", re.IGNORECASE)
-#: Words of names that tell photographs from masks, not what they show.
+#: Words in names that describe the kind of image, not its content
 _KINDS = (
     "rgb rgbs img image images color colour photo frame mask masks fmask matte alpha silhouette seg label"
 )
-#: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
+#: Quarter turns, as for ``numpy.rot90``, by EXIF orientation
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """One decoded photograph as it is shown."""
+    """A decoded photograph as shown, with its EXIF rotation applied."""
 
     image: np.ndarray  #: [h, w, 3] uint8, RGB
-    alpha: np.ndarray | None  #: [h, w] uint8 where the file has it
-    turns: int  #: quarter turns that showing it took, as of ``numpy.rot90``
+    alpha: np.ndarray | None  #: [h, w] uint8; None if the file has no alpha
+    turns: int  #: applied quarter turns, as for ``numpy.rot90``
 
     @property
     def size(self) -> tuple[int, int]:
@@ -44,21 +44,15 @@ class Pixels:
 
     @property
     def stored_size(self) -> tuple[int, int]:
-        """(height, width) as the file stores it."""
+        """(height, width) as stored in the file."""
         return self.size[::-1] if self.turns % 2 else self.size
 
 
 def read_pixels(path: Path) -> Pixels:
-    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says.
-
-    Args:
-        path: of the photograph.
-
-    Returns:
-        The photograph as shown.
+    """Decode a photograph with 8 bits per channel and apply its EXIF rotation.
 
     Raises:
-        InputError: it is missing, cannot be decoded, has other values, or is mirrored.
+        InputError: the file is missing, cannot be decoded, has other values, or is mirrored.
     """
     image = read_image(path)
     orientation = orientation_of(image, path)
@@ -75,13 +69,13 @@ def read_pixels(path: Path) -> Pixels:
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
     """Whether a camera was calibrated with the photograph as stored, not as shown.
 
-    With ``auto`` the size of the calibration tells for quarter turns; otherwise it is as shown,
-    since OpenCV turns photographs on reading.
+    With ``auto``, it depends on the size of the calibration for quarter turns; otherwise the answer is no,
+    since OpenCV applies the EXIF rotation when it reads photographs.
 
     Args:
         pixels: the decoded photograph.
-        camera: as its file stores it.
-        exif: ``auto`` | ``stored`` | ``shown``, by the user.
+        camera: the camera as stored in its file.
+        exif: ``auto`` | ``stored`` | ``shown``, the user's choice.
     """
     if exif != "auto" or not pixels.turns:
         return exif == "stored"
@@ -90,29 +84,26 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
 
 
 def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
-    """``calibration.names`` as text in its composed spelling: numbers, too, are names of cameras.
+    """Convert ``calibration.names`` (cameras by photograph) to text in Unicode's composed form.
 
     Args:
-        names: the camera of each photograph of another name, text or numbers; None: none.
-
-    Returns:
-        The same as text, in Unicode's composed form.
+        names: keys and values are text or numbers; None: empty.
     """
     return {normalize_name(str(key)): normalize_name(str(name)) for key, name in (names or {}).items()}
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
-    """Photographs of a folder, no masks.
+    """List the photographs of a folder, without masks.
 
     Args:
-        folder: where they lie.
-        suffixes: of photographs, in lower case with their point.
+        folder: the folder.
+        suffixes: suffixes of photographs, in lower case with the dot.
 
     Returns:
         Paths by name without suffix, sorted.
 
     Raises:
-        InputError: two have one name.
+        InputError: two photographs have the same name, or a folder has the name of a photograph.
     """
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
@@ -127,22 +118,19 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
 
 
 def parts_of_name(name: str) -> tuple[str, ...]:
-    """Words and numbers of a name, without those of its kind: of ``cam1_rgb007`` cam, 1, 007.
-
-    Args:
-        name: of a photograph or a mask, without suffix.
-    """
+    """Split a name without suffix into words and numbers, without the words for the kind of image:
+    ``cam1_rgb007`` becomes cam, 1, 007."""
     parts = re.findall(r"\d+|[^\W\d_]+", normalize_name(name).casefold())
     return tuple(part for part in parts if part not in _KINDS.split())
 
 
 def mask_alike(folder: Path, name: str, is_beside: bool) -> Path | None:
-    """The only mask of a folder whose name has the same parts (:func:`parts_of_name`).
+    """Find the only mask in a folder whose name has the same parts (:func:`parts_of_name`).
 
     Args:
-        folder: where it may lie.
-        name: of a photograph, without suffix.
-        is_beside: whether photographs lie in this folder, too.
+        folder: the folder; may be missing.
+        name: name of a photograph, without suffix.
+        is_beside: whether the folder also contains photographs.
     """
     if not folder.is_dir():
         return None
@@ -153,7 +141,7 @@ def mask_alike(folder: Path, name: str, is_beside: bool) -> Path | None:
 
 @functools.lru_cache(maxsize=64)
 def _by_parts(folder: Path, changed: int) -> dict[tuple[str, ...], list[Path]]:
-    """Images of a folder that has not ``changed`` by the parts of their names."""
+    """Images of a folder by the parts of their names, cached by its modification time ``changed``."""
     paths: dict[tuple[str, ...], list[Path]] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
@@ -162,15 +150,15 @@ def _by_parts(folder: Path, changed: int) -> dict[tuple[str, ...], list[Path]]:
 
 
 def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
-    """Find an image of a folder by name.
+    """Find an image in a folder by name.
 
     Args:
-        folder: where it may lie.
-        names: without suffix, the preferred first.
-        suffixes: of images, in lower case with their point.
+        folder: the folder.
+        names: names without suffix, the preferred first.
+        suffixes: suffixes of images, in lower case with the dot.
 
     Returns:
-        The path; None where there is none.
+        The path, or None.
     """
     return next((path for name in names if (path := find_path(folder, name, suffixes))), None)
 
@@ -178,17 +166,17 @@ def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES)
 def require_all_read(
     folder: Path, read: Collection[str], known: Collection[str], suffixes: tuple[str, ...] = SUFFIXES
 ) -> None:
-    """Refuse to leave out a photograph or video without a word.
+    """Check that no photograph or video is silently left out.
 
     Args:
-        folder: of photographs or of videos.
-        read: names of those that are read; what lies beside them under their names is no matter.
-        known: further names: of cameras or instants.
-        suffixes: of what is read, for the message.
+        folder: folder of photographs or videos.
+        read: names of the files that are read; other files with these names are ignored.
+        known: further names, of cameras or instants.
+        suffixes: supported suffixes, for the message.
 
     Raises:
-        InputError: there is a picture of a kind that is not read, or another file of a known name,
-            such as ``right.heic`` or ``right.jpg.part``.
+        InputError: there is an image of an unsupported format, or another file with a known name, such as
+            ``right.heic`` or ``right.jpg.part``.
     """
     for path in sorted(folder.iterdir()):
         name = normalize_name(path.name)
@@ -207,22 +195,22 @@ def require_all_read(
 def find_instants(
     folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
 ) -> dict[str, dict[str, Path]]:
-    """Find photographs in a folder itself or in its folders.
+    """Find photographs in a folder or in its subfolders.
 
-    A folder is an instant with a photograph of every camera, or, if named after a camera, has one
-    photograph for each instant. Names may begin with the camera's (``front_rgb0001``). Of several
-    instants one may lack photographs.
+    A subfolder contains one instant with a photograph of every camera, or, if named after a camera, one
+    photograph per instant. Names may start with the camera's (``front_rgb0001``). In a sequence, instants
+    may lack photographs.
 
     Args:
-        folder: of photographs, or of such folders.
-        cameras: by name.
-        names: the camera of a photograph (or camera's folder) of another name.
+        folder: folder of photographs, or of such folders.
+        cameras: cameras by name.
+        names: cameras of photographs (or of cameras' folders) with other names.
 
     Returns:
         ``{instant: {camera: path}}``.
 
     Raises:
-        InputError: there are none, or photographs do not fit the cameras.
+        InputError: there are no photographs, or they do not match the cameras.
     """
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
@@ -255,8 +243,8 @@ def find_instants(
 def _split_names(
     photographs: Mapping[str, Path], cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
 ) -> dict[str, dict[str, Path]]:
-    """Photographs by camera and by what follows its name; empty unless all begin with the names of
-    cameras and none is that of a camera."""
+    """Photographs by camera and by the rest of their names; empty unless all names start with a camera's
+    and none is equal to one."""
     of_cameras: dict[str, dict[str, Path]] = {}
     for name, path in photographs.items():
         parts = parts_of_name(name)
@@ -271,14 +259,7 @@ def _split_names(
 
 
 def counted(name: str) -> list[str | int]:
-    """Sort key of names by which numbers follow one another: 2 before 10.
-
-    Args:
-        name: of an instant.
-
-    Returns:
-        Its parts, text and numbers in turn.
-    """
+    """Sort key of names that orders numbers by value: 2 before 10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
@@ -301,8 +282,8 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
 
 
 def _without_folder(paths: Mapping[str, Path]) -> Mapping[str, Path]:
-    """Photographs of a camera by the parts of their names that do not repeat their folder's;
-    as given where that makes two of them alike."""
+    """Photographs of a camera by their names without the folder's name, or unchanged if names would
+    coincide."""
     named = {}
     for name, path in paths.items():
         parts, folder = parts_of_name(name), parts_of_name(path.parent.name)
@@ -312,16 +293,16 @@ def _without_folder(paths: Mapping[str, Path]) -> Mapping[str, Path]:
 
 
 def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
-    """The camera of a photograph, by its name.
+    """Find the camera of a photograph by its name.
 
     Args:
-        name: of the photograph, without suffix.
+        name: name of the photograph, without suffix.
         cameras: names of all cameras.
-        names: cameras of photographs of other names.
+        names: cameras of photographs with other names.
 
     Returns:
-        What ``names`` says, or the camera of this name, or the only one whose name differs by upper
-        and lower case alone; the name itself where there is none.
+        The camera of ``names``, or the one of this name, or the only one whose name differs only by
+        case; without any, the name itself.
     """
     wanted = names.get(name, name)
     alike = [camera for camera in cameras if camera.casefold() == wanted.casefold()]
@@ -335,20 +316,18 @@ def by_camera(
     names: Mapping[str, str],
     least: int = 2,
 ) -> dict[str, Any]:
-    """Values by camera instead of by name of a photograph, of a video or of a camera's folder.
+    """Map values from names of photographs, videos or folders to cameras.
 
     Args:
-        folder: where they lie, for messages.
-        values: by name.
-        cameras: by name.
-        names: cameras of photographs of other names.
-        least: number of values that there must be.
-
-    Returns:
-        The values by camera.
+        folder: folder of the values, for messages.
+        values: values by name.
+        cameras: cameras by name.
+        names: cameras of photographs with other names.
+        least: minimum number of values.
 
     Raises:
-        InputError: a name is that of no camera, two are of one, or there are fewer than ``least``.
+        InputError: a name matches no camera, two names match the same camera, or there are fewer than
+            ``least`` values.
     """
     named = {name: camera_named(name, cameras, names) for name in values}
     unknown = [name for name, camera in named.items() if camera not in cameras]
