@@ -1,7 +1,7 @@
-"""Making of data: people, rigs of cameras, photographs, scans.
+"""Generate data: people, camera rings, renderings of people and of scans.
 
-A plug-in of :mod:`ghgs_lit` by the same entry point as a user's: it offers data sets that are
-rendered, and the parts of its bodies.
+A plug-in of :mod:`ghgs_lit`, loaded through the same entry point as a user's: it registers data sets of
+rendered people, and the body parts of built-in people.
 """
 
 from ghgs_lit.config.registry import PARTS, offer

@@ -1,4 +1,4 @@
-"""Configurable data sets of rendered people: generated people and scans."""
+"""Configurable data sets of rendered people: generated ones and scans."""
 
 import functools
 import hashlib
@@ -31,21 +31,21 @@ from ghgs_people.jobs import (
 from ghgs_people.rig import Rig, RigOptions
 from ghgs_people.scans import ScanSource
 
-# Seed of built-in people: they are one population, numbered.
+# Seed of built-in people, which form one numbered population
 _PEOPLE_SEED = 0
-# Seed of heights, yaws, lights and of the split by fraction of scans.
+# Seed of heights, yaws and lights, and of the split of scans by fraction
 _SEED = 0
 
 
 class _Renderable(Rendered):
-    """A data set that this package renders, from a ring of cameras around each subject."""
+    """Base of data sets that this package renders with a ring of cameras around each subject."""
 
     ring: ClassVar[int] = Rig.positions
 
     render: RenderOptions = RenderOptions()
-    """What is rendered of each person."""
+    """Renderings of each person."""
     render_workers: Workers | None = None
-    """Rendering processes; null: one for each core; 0: no further process."""
+    """Number of rendering processes; null: one per core; 0: render in this process."""
 
     rig: RigOptions = RigOptions()
     """The ring of cameras around each subject."""
@@ -56,7 +56,7 @@ FIRST_VAL = 1_000_000
 
 
 class People(Options):
-    """Numbers of people; larger ones extend the same cache."""
+    """Numbers of people; increasing them extends the same cache."""
 
     group = "data.people"
 
@@ -67,7 +67,7 @@ class People(Options):
 
 
 class ActivePeople(Options):
-    """Numbers of further people, in poses of sport and dance; larger ones extend the same cache."""
+    """Numbers of additional people in poses of sport and dance; increasing them extends the same cache."""
 
     group = "data.active"
 
@@ -78,8 +78,7 @@ class ActivePeople(Options):
 
 
 class Synthetic(_Renderable):
-    """Generated people in a ring of cameras, rendered on first use and kept in a cache folder named after all
-    their settings."""
+    """Generated people, rendered on first use into a cache folder named after all their settings."""
 
     limit: ClassVar[Limit] = Limit()
     pixel_centers: ClassVar[str] = "half"
@@ -89,22 +88,22 @@ class Synthetic(_Renderable):
     size: Size = 140
     render: RenderOptions = RenderOptions(size=140)
     people: People = People()
-    """Number of people."""
+    """Numbers of people."""
     active: ActivePeople = ActivePeople()
-    """Number of further people, in poses of sport and dance."""
+    """Numbers of additional people in poses of sport and dance."""
     cache_dir: options.PathText | None = None
     """Folder of the caches; null: $GHGS_CACHE or ~/.cache/ghgs_lit."""
 
     @property
     def root(self) -> str:
-        """The cache's folder, named after everything that the photographs depend on."""
+        """Cache folder, named after all settings that the photographs depend on."""
         made_with = identity(self.rig.build(), self.render, _PEOPLE_SEED)
         made_with["people"] = people_version()
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         try:
             return str(Path(cache).expanduser() / f"synthetic-{key}")
-        except RuntimeError:  # a user that the container does not know
+        except RuntimeError:  # the user has no home directory in the container
             expected = "a folder, or one in GHGS_CACHE, where there is no home directory"
             raise InputError(f"data.cache_dir: expected {expected}; found {cache}") from None
 
@@ -125,10 +124,10 @@ class Synthetic(_Renderable):
         return names
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people that the cache lacks.
+        """Render the people that are missing in the cache.
 
         Args:
-            splits: ``train``, ``val`` or frozen people (:mod:`.bench`).
+            splits: ``train``, ``val`` or splits of frozen people (:mod:`.bench`).
 
         Raises:
             InputError: frozen people differ from their definition, or people cannot be rendered.
@@ -154,22 +153,22 @@ class Synthetic(_Renderable):
 
 
 class Scans(DataSet, _Renderable):
-    """Scans rendered to ``root``; :meth:`render_missing` renders them from ``source``."""
+    """Scans, rendered from ``source`` into ``root`` by :meth:`render_missing`."""
 
     name: Text = "scans"
     size: Size = 140
     render: RenderOptions = RenderOptions(lights="none")
     source: options.PathText | None = None
-    """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
+    """Folder of textured meshes <id>/<id>.obj or .glb; only needed for rendering."""
     split: options.PathText | dict[str, tuple[Text, ...] | None] | None = None
-    """Which subjects are train and val: a folder with split_train.txt and split_val.txt, or
-    {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering,
-    the split files in source, else a fraction."""
+    """Subjects of train and val: a folder with split_train.txt and split_val.txt, or {train: [0000-0425],
+    val: [0426-0525]}. null: the folders train and val of root; when rendering, the split files in source,
+    else val_fraction."""
     val_fraction: Share = 0.1
-    """Fraction of the scans that is val where no split decides, at least one of them."""
+    """Fraction of the scans, at least one, for val if no split is given."""
     pixel_centers: Literal["half", "integer", "auto"] = "half"
-    """Pixel centres of the files. half: rendered by this package; integer: by the published
-    scripts; auto: whichever it was."""
+    """Pixel centres of the intrinsics in files. half: rendered by this package; integer: by the published
+    scripts; auto: detected."""
 
     def subject_names(self, phase: str) -> list[str] | None:
         if self.split is None:
@@ -183,7 +182,7 @@ class Scans(DataSet, _Renderable):
 
     @property
     def source_folder(self) -> Path:
-        """The folder of the scans.
+        """Folder of the scans.
 
         Raises:
             InputError: ``source`` is null.
@@ -191,21 +190,20 @@ class Scans(DataSet, _Renderable):
         return required_folder("data.source", "a folder of scans", self.source)
 
     def scans(self) -> PersonSource:
-        """The source of the scans."""
+        """Loader of the scans."""
         return ScanSource(self.source_folder)
 
     def make(self) -> None:
         self.render_missing()
 
     def render_missing(self) -> int:
-        """Render the scans of the split (up to ``limit``) that ``root`` lacks.
+        """Render the scans of the split (up to ``limit``) that are missing in ``root``.
 
         Returns:
-            Number of scans rendered now.
+            Number of newly rendered scans.
 
         Raises:
-            InputError: ``source`` or ``root`` is null, a scan is bad,
-                or ``root`` holds something else.
+            InputError: ``source`` or ``root`` is null, a scan is invalid, or ``root`` contains other data.
         """
         source = self.scans()
         root = required_folder("data.root", "a folder", self.root)
@@ -218,7 +216,7 @@ class Scans(DataSet, _Renderable):
 
 @functools.cache
 def people_version() -> str:
-    """A hash of the code and assets that generate people, for the names of caches."""
+    """Hash of the code and assets that generate people, for the names of caches."""
     digest = hashlib.sha256()
     folder = Path(figures.__file__).parent
     for path in sorted(folder.rglob("*")):

@@ -1,10 +1,10 @@
-"""Rendering of many people in several processes: resumable, with the same files for the same seed.
+"""Render many people in several processes: resumable, and reproducible for the same seed.
 
-Workers are spawned (a fork of a process that runs threads may hang): each imports the script that
-called :func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to
-workspaces; the process that holds the lock moves finished subjects to their place
-(:mod:`ghgs_lit.data.layout`). Besides the files described there, ``<root>/rendering/`` has
-``settings.json`` (the settings of the files), ``lock`` and ``tmp/`` (workspaces)."""
+Workers are spawned (forking a process with threads may hang): each imports the script that called
+:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to workspaces;
+the process that holds the lock moves finished subjects to their place (:mod:`ghgs_lit.data.layout`). In
+addition to the files described there, ``<root>/rendering/`` contains ``settings.json`` (the settings of
+the files), ``lock`` and ``tmp/`` (workspaces)."""
 
 import functools
 import json
@@ -49,50 +49,44 @@ from ghgs_people.writing import write_body, write_view
 log = logging.getLogger(__name__)
 
 _GUARD = 'if __name__ == "__main__":'
-# Part of every cache key: to be increased when photographs of the same settings change.
+# Part of every cache key; increase it when the same settings yield other photographs
 RENDER_VERSION = 3
-#: Workers compute with one thread each: those of NumPy's products wait by spinning.
+#: One thread per worker, since the threads of NumPy's matrix products wait by spinning
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-#: Folders of the files of a subject, in the order in which they are moved to their place.
+#: Folders of a subject's files, in the order in which they are moved to their place
 _KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
-#: Lights of all people.
+#: Distribution of the lights of all people
 LIGHTS = Lights()
 
 
 class PersonSource(Protocol):
-    """A source of people; it can be pickled."""
+    """Loader of people; must be picklable."""
 
     def load(self, name: str) -> Person:
-        """Read or make a person.
-
-        Args:
-            name: of the person.
+        """Read or generate a person.
 
         Raises:
-            InputError: the person is bad.
+            InputError: the person's data is invalid.
         """
 
     def facing(self, name: str) -> float:
-        """Tell where a person faces.
-
-        Args:
-            name: of the person.
+        """Direction that a person faces.
 
         Returns:
             Degrees by which the first camera is turned about y to face the person.
         """
 
 
-#: First letter of the names of generated people in poses of sport and dance.
+#: First letter of the names of generated people in poses of sport and dance
 ACTIVE = "a"
 
 
 @dataclass(frozen=True)
 class SyntheticSource:
-    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``.
+    """Generator of people, named ``p<index>``, or ``a<index>`` in poses of sport and dance.
 
     Args:
-        seed: of the family, at least 0.
+        seed: seed of the population, at least 0.
     """
 
     seed: int
@@ -105,35 +99,31 @@ class SyntheticSource:
 
 
 class RenderOptions(Options):
-    """What is rendered of each person."""
+    """Renderings of each person."""
 
     group = "data.render"
 
     size: Size = 512
     """Side or [height, width] of the photographs in pixels."""
     samples: int = Field(3, ge=1, le=16)
-    """Each pixel is the mean of samples x samples rays."""
+    """Rays along each side of a pixel, which is the mean of samples x samples rays."""
     positions: tuple[Index, ...] | None = None
     """Ring positions to render; null: all."""
     views: tuple[ViewNumber, ...] = Field((RING_VIEW, 2, 3, 4), min_length=1)
-    """Views at each position: 0 the ring camera, 1 the next, 3 the middle, 2 and 4 random between.
-    Targets need 0, 2, 3 and 4, stereo methods need 1."""
+    """Views at each position: 0 the ring camera, 1 the next one, 3 halfway, 2 and 4 random in between.
+    Targets need 0, 2, 3 and 4; stereo methods need 1."""
     quality: int = Field(98, ge=1, le=100)
-    """Of the JPEG files."""
+    """Quality of the JPEG files."""
     lights: Literal["studio", "none"] = "studio"
-    """studio: white lights around each person, for textures without light; none: textures as they
-    are, for scans, whose textures are photographs with the light of their day."""
+    """studio: white lights around each person, for textures without shading; none: textures unchanged, for
+    scans, whose textures are photographs that already contain the lighting."""
 
 
 def everything(rig: Rig, settings: RenderOptions) -> dict:
-    """All settings besides the seed that photographs of a person depend on.
-
-    Args:
-        rig: the cameras.
-        settings: what is rendered.
+    """All settings, except the seed, that photographs of a person depend on.
 
     Returns:
-        Plain data, under ``rig`` and ``render``.
+        Plain data with the keys ``rig`` and ``render``.
     """
     cameras = {**asdict(rig), "variation": rig.variation.model_dump()}
     lights = asdict(LIGHTS) if settings.lights == "studio" else settings.lights
@@ -141,20 +131,18 @@ def everything(rig: Rig, settings: RenderOptions) -> dict:
 
 
 def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
-    """:func:`everything` with the seed, in the form of cache keys and stored settings.
+    """Settings of :func:`everything` with seed and renderer version, as plain data for cache keys and
+    stored settings.
 
     Args:
         rig: the cameras.
-        settings: what is rendered.
-        seed: of heights, yaws and lights.
-
-    Returns:
-        Plain data, with the version of the renderer.
+        settings: renderings of each person.
+        seed: seed of heights, yaws and lights.
     """
     cameras, render = everything(rig, settings).values()
-    render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
+    render["vids"] = render.pop("views")  # name in stored data sets and cache keys
     still = STILL.model_dump()
-    # Names of caches do not depend on variations that are off.
+    # Names of caches do not depend on variations that are disabled.
     varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
     if varied:
         cameras["variation"] = varied
@@ -164,7 +152,7 @@ def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
 def render_person(
     source: PersonSource, rig: Rig, settings: RenderOptions, seed: int, workspace: Path, name: str
 ) -> str:
-    """Render one person into a folder; returns why the person is bad, or an empty text."""
+    """Render one person into a folder; returns why the person is invalid, or an empty text."""
     try:
         _render(source, rig, settings, seed, workspace, name)
     except InputError as error:
@@ -180,7 +168,7 @@ def _render(
     yaws = rig.yaws(rng) + source.facing(name)
     lights = LIGHTS.draw(rng)
     height, width = settings.size
-    # A separate generator: heights, yaws and lights do not depend on what is varied.
+    # A separate generator, so that heights, yaws and lights do not depend on variations.
     rig, poses = rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
     studio = Studio(person, None if settings.lights == "none" else lights, settings.samples)
     for position in range(len(yaws)) if settings.positions is None else settings.positions:
@@ -211,26 +199,26 @@ def render_people(
     workers: int | None = None,
     shown: bool = True,
 ) -> int:
-    """Render people below ``root``; existing ones are kept.
+    """Render people into ``root``; existing ones are kept.
 
-    It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
+    The process may be killed, repeated, or started twice: a second process waits for the first.
 
     Args:
         root: folder of the data set.
-        names: people of each phase.
+        names: names of people by phase.
         source: loads a person by name.
         rig: the cameras around each person.
-        settings: what is rendered of each person.
-        seed: of heights, yaws and lights.
-        workers: number of processes; None: one for each core; 0: only this one.
-        shown: whether there is a progress bar.
+        settings: renderings of each person.
+        seed: seed of heights, yaws and lights.
+        workers: number of processes; None: one per core; 0: only this one.
+        shown: show a progress bar.
 
     Returns:
-        Number of people rendered now.
+        Number of newly rendered people.
 
     Raises:
-        InputError: ``root`` holds something else, a position is not on the rig, the script has no
-            main guard, or people are bad: the others are rendered, then these are named.
+        InputError: ``root`` contains other data, a position is not on the rig, the script has no main
+            guard, or people are invalid (raised after all others are rendered).
         RuntimeError: a rendering process died.
     """
     # A worker that imports a script without a main guard would wait for its parent forever.
@@ -250,7 +238,7 @@ def render_people(
     workspaces = notes.folder / "tmp"
     with lock(notes.folder / "lock", wait=True) as held, name_folder_in_errors(notes.root):
         require(held, str(root), "one rendering at a time in a process", "another")
-        check_settings(notes, made_with)  # another process may have written others meanwhile
+        check_settings(notes, made_with)  # another process may have stored others in the meantime
         shutil.rmtree(workspaces, ignore_errors=True)  # of killed runs
         _request(notes, names)
         todo = []
@@ -278,10 +266,10 @@ def render_people(
 
 
 def check_settings(notes: Completeness, settings: dict) -> None:
-    """Store the settings in an empty data set; refuse a data set with others.
+    """Store the settings in an empty data set, or check that a data set has the same ones.
 
     Args:
-        notes: of the data set.
+        notes: records of the data set.
         settings: nested plain data (:func:`identity`).
 
     Raises:
@@ -303,7 +291,7 @@ def check_settings(notes: Completeness, settings: dict) -> None:
 
 
 def _request(notes: Completeness, names: Mapping[str, Sequence[str]]) -> None:
-    """Store which subjects of each phase were requested."""
+    """Store the names of requested subjects by phase."""
     known = notes.plan
     plan = {}
     for phase in known.keys() | names.keys():
@@ -312,7 +300,7 @@ def _request(notes: Completeness, names: Mapping[str, Sequence[str]]) -> None:
 
 
 def _publish(notes: Completeness, phase: str, name: str, workspace: Path) -> None:
-    """Move a subject to its place, then mark it as complete."""
+    """Move a subject's files to their place, then mark it as complete."""
     for kind in _KINDS:
         for source in sorted((workspace / kind).glob("*")):
             target = notes.root / phase / kind / source.name
@@ -329,13 +317,13 @@ def _publish(notes: Completeness, phase: str, name: str, workspace: Path) -> Non
 def _map(
     render: Callable[[Path, str], str], folders: list[Path], names: list[str], workers: int | None
 ) -> Iterator[tuple[int, str]]:
-    """Positions and results of ``render`` as they are done, from ``workers`` processes (None: one for each
-    core; 0 or 1: only this one)."""
+    """Yield indices and results of ``render`` as completed by ``workers`` processes (None: one per core;
+    0 or 1: only this one)."""
     workers = min(len(names), allowed_cores() if workers is None else workers)
     if workers < 2:
         yield from enumerate(map(render, folders, names))
         return
-    compile_kernels()  # before the workers would, each for itself
+    compile_kernels()  # once, instead of in each worker
     use_known_start_method()
     context = multiprocessing.get_context("spawn")
     with (
@@ -355,8 +343,8 @@ def _map(
 
 
 def start_worker() -> None:
-    """Prepare a worker: one thread, signals of a terminal or SLURM only in the parent, and an end with
-    the parent."""
+    """Initialise a worker: one thread, signals of a terminal or SLURM are left to the parent, and it exits
+    with the parent."""
     torch.set_num_threads(1)
     for each in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
         signal.signal(each, signal.SIG_IGN)

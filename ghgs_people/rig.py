@@ -1,9 +1,9 @@
-"""The ring of cameras that THuman2.0 is rendered with, and the placement of a subject in it.
+"""Ring of cameras with which THuman2.0 is rendered, and placement of a subject in it.
 
-``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is
-the ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are
-random in the first and the second half of the step. Yaw 0 sees the front of a subject that faces
-+z. A :class:`Variation` gives each subject its own ring and moves single cameras."""
+``positions`` cameras are evenly spaced around the subject. The views at each position are numbered: 0 is
+the ring camera itself, 1 the next ring camera, 3 exactly halfway between the two, 2 and 4 are random in
+the first and the second half of the step. A camera at yaw 0 sees the front of a subject that faces +z. A
+:class:`Variation` changes the ring per subject and moves single cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.types import Cameras
 from ghgs_people.figures.mesh import Person
 
-# Margin around a subject with a varied ``fill``, as a share of the image's height.
+# Margin around a subject with a varied ``fill``, as a fraction of the image's height
 _MARGIN = 0.01
 
 Pitch = Annotated[float, Field(gt=-89, lt=89)]
@@ -27,29 +27,26 @@ Fill = Annotated[float, Field(gt=0, lt=1)]
 
 
 class Variation(Options):
-    """Differences of rigs between subjects, and of single cameras from their ring;
-    null and 0: none."""
+    """Variation of rigs between subjects, and of single cameras from their ring; null or 0: none."""
 
     group = "data.rig.variation"
 
     radius: tuple[Positive, Positive] | None = None
-    """[least, greatest] radius of a subject's ring, metres."""
+    """[least, greatest] radius of a subject's ring, in metres."""
     pitch: tuple[Pitch, Pitch] | None = None
-    """[least, greatest] pitch of a subject's ring, degrees;
-    a ring that looks down stands higher."""
+    """[least, greatest] pitch of a subject's ring, in degrees; a ring that looks down is higher."""
     fill: tuple[Fill, Fill] | None = None
-    """[least, greatest] share of the image's height that a subject takes up in the camera
-    that sees it tallest: decides the focal length. Less where it would not fit into every
-    image of the ring."""
+    """[least, greatest] fraction of the image's height that a subject fills in the camera where it is
+    tallest, which sets the focal length. Less if it would not fit into every image of the ring."""
     camera_pitch: Tilt = 0.0
-    """Degrees: greatest deviation of single cameras."""
+    """Largest deviation of the pitch of single cameras, in degrees."""
     camera_roll: float = Field(0.0, ge=0, le=180)
-    """Degrees: greatest roll of single cameras."""
+    """Largest roll of single cameras, in degrees."""
     camera_look_at: Amount = 0.0
-    """Metres: greatest shift of single cameras and of what they look at, along each axis."""
+    """Largest shift of single cameras and of the points they look at along each axis, in metres."""
     between_pitch: Tilt = 0.0
-    """Degrees: greatest deviation of the views between ring cameras (2, 3 and 4), which only
-    targets take: subjects are also seen from higher and from lower than by any input."""
+    """Largest deviation of the pitch of views between ring cameras (2, 3 and 4), in degrees. Only targets
+    use these views, so subjects are also seen from higher and lower than in any input."""
 
     @model_validator(mode="after")
     def _check(self) -> "Variation":
@@ -64,14 +61,14 @@ STILL = Variation()
 
 
 class RigOptions(Options):
-    """Options of the ring of cameras with which the published scripts render THuman2.0."""
+    """Ring of cameras with which the published scripts render THuman2.0."""
 
     group = "data.rig"
 
     height: Positive | None = 1.80
-    """Metres that subjects are scaled to, give or take 0.05; null: they keep their own height."""
+    """Height in metres to which subjects are scaled, +-0.05; null: their own height."""
     variation: Variation = Variation()
-    """Of the rig, between subjects and between single cameras."""
+    """Variation of the rig between subjects and of single cameras."""
 
     def build(self) -> "Rig":
         return Rig(height=self.height, variation=self.variation)
@@ -79,8 +76,7 @@ class RigOptions(Options):
 
 @dataclass(frozen=True)
 class Poses:
-    """Deviations of cameras [...] from their ring: degrees of pitch and roll,
-    metres of shift [..., 3]."""
+    """Deviations of cameras [...] from their ring: pitch and roll in degrees, shift [..., 3] in metres."""
 
     pitch: np.ndarray | float = 0.0
     roll: np.ndarray | float = 0.0
@@ -92,11 +88,11 @@ class Poses:
 
 @dataclass(frozen=True)
 class Rig:
-    """A ring of cameras; defaults are those of the published scripts."""
+    """A ring of cameras, by default that of the published scripts."""
 
     positions: int = 16
     radius: float = 2.0  # distance of the cameras from ``look_at``, metres
-    # the point that all cameras look at, metres
+    # point that all cameras look at, metres
     look_at: tuple[float, float, float] = (0.0, 0.85, 0.0)
     pitch: float = -8.0  # degrees; below 0 the cameras look down
     focal: float = 0.8  # focal length as a fraction of the image's height
@@ -109,11 +105,10 @@ class Rig:
     variation: Variation = STILL
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw the yaws of all views of one subject.
+        """Sample the yaws of all views of one subject.
 
         Args:
-            rng: draws the turn of the ring, and where the views 2 and 4 stand between
-                two ring cameras.
+            rng: samples the rotation of the ring and the positions of views 2 and 4 between ring cameras.
 
         Returns:
             Yaws [positions, 5] in degrees of views 0 to 4.
@@ -125,16 +120,16 @@ class Rig:
         return start[:, None] + step * offsets
 
     def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
-        """Cameras of the ring.
+        """Create cameras of the ring.
 
         Args:
             yaws: degrees about y, any shape; 0 sees the front of a subject that faces +z.
-            height: of the images, pixels.
-            width: of the images, pixels.
-            poses: deviations of the cameras, of the shape of ``yaws``; None: none.
+            height: height of the images, pixels.
+            width: width of the images, pixels.
+            poses: deviations of the cameras, in the shape of ``yaws``; None: none.
 
         Returns:
-            Cameras of the shape of ``yaws``, float32, metres.
+            Cameras in the shape of ``yaws``, float32, metres.
         """
         poses = poses or Poses()
         yaw, pitch, roll = (
@@ -203,7 +198,7 @@ class Rig:
         return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
 
     def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest (x/z, y/z) [n, 2] of a placed subject in the images of n cameras."""
+        """Smallest and largest (x/z, y/z) [n, 2] of a placed subject in n cameras."""
         vertices = np.concatenate([part.vertices for part in person.parts])
         low = []
         high = []
@@ -217,14 +212,14 @@ class Rig:
         return np.stack(low), np.stack(high)
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
-        """Scale and centre a person, with the feet on y = 0; the body vertices are moved, too.
+        """Scale and centre a person and its body vertices, with the feet on y = 0.
 
         Args:
-            person: in any unit, y up.
-            rng: draws the height.
+            person: a person in any unit, y up.
+            rng: samples the height.
 
         Returns:
-            The person in metres; at its own height and in its own unit where ``height`` is None.
+            The person in metres; with its own height and unit if ``height`` is None.
 
         Raises:
             InputError: the person has no height.

@@ -1,12 +1,12 @@
-"""THuman2.0: raw scans with SMPL-X fits as released, and renders.
+"""THuman2.0: raw scans with SMPL-X fits as released, and their renderings.
 
 ::
 
     <source>/<id>/<id>.obj, material0.jpeg, material0.mtl     526 scans 0000 ... 0525, y up, no metric units
     <fits>/<id>/smplx_param.pkl, mesh_smplx.obj               the fit, in the frame of its scan
 
-Renders have the layout of :mod:`ghgs_lit.data.layout`; those of GPS-Gaussian, GHG, RoGSplat and the
-authors' release can be read unchanged."""
+Renderings have the layout of :mod:`ghgs_lit.data.layout`; those of GPS-Gaussian, GHG, RoGSplat and the
+authors' release can be read without conversion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from ghgs_people.figures.mesh import Person
 from ghgs_people.jobs import RenderOptions
 from ghgs_people.scans import ScanSource
 
-# Names of the folder of fits in published archives and scripts.
+# Names of the folder of fits in published archives and scripts
 FIT_FOLDERS = ("THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "THuman2.0_SMPLX_Paras", "smplx_2", "smplx")
 
 
@@ -36,10 +36,10 @@ def find_fits(source: Path, fits: str | None) -> Path | None:
 
     Args:
         source: folder of the scans.
-        fits: the configured folder; None: one of :data:`FIT_FOLDERS` in or next to ``source``.
+        fits: configured folder; None: one of :data:`FIT_FOLDERS` in or next to ``source``.
 
     Returns:
-        The folder; None if there is none.
+        The folder, or None.
 
     Raises:
         InputError: the configured folder does not exist.
@@ -57,11 +57,11 @@ def find_fits(source: Path, fits: str | None) -> Path | None:
 
 @dataclass(frozen=True)
 class THuman2Source(ScanSource):
-    """Raw scans with their bodies.
+    """Raw scans with their SMPL-X bodies.
 
     Args:
-        folder: of the scans.
-        fits: folder of the fits; None: scans have no body.
+        folder: folder of the scans.
+        fits: folder of the fits; None: scans without bodies.
     """
 
     fits: Path | None = None
@@ -76,7 +76,7 @@ class THuman2Source(ScanSource):
             The scan, in its own unit, with the vertices [n, 3] of its fit.
 
         Raises:
-            InputError: the scan or fit is bad, or the body lies outside its scan.
+            InputError: the scan or fit is invalid, or the body lies outside of the scan.
         """
         scan = super().load(name)
         if self.fits is None:
@@ -88,9 +88,9 @@ class THuman2Source(ScanSource):
         return replace(scan, body_vertices=body.astype(np.float32))
 
     def facing(self, name: str) -> float:
-        """Tell where a scan faces, by the root rotation of its fit (``global_orient`` of SMPL-X).
+        """Direction that a scan faces, from the root rotation of its fit (``global_orient`` of SMPL-X).
 
-        The fit's pickle is read without executing it.
+        The fit's pickle is read without executing code in it.
 
         Args:
             name: id of the scan.
@@ -100,7 +100,7 @@ class THuman2Source(ScanSource):
             without a fit.
 
         Raises:
-            InputError: the fit is missing or bad.
+            InputError: the fit is missing or invalid.
         """
         if self.fits is None:
             return 0.0
@@ -114,15 +114,15 @@ class THuman2Source(ScanSource):
         return float(np.degrees(np.arctan2(forward[0], forward[2])))
 
     def _fit(self, name: str, file: str) -> Path:
-        """A file of a scan's fit, in any spelling of upper and lower case."""
+        """Path of a file of a scan's fit, found regardless of case."""
         folder = find_path(self.fits, name) or self.fits / name
         require_folder(folder, "the scan's SMPL-X fit")
         return find_path(folder, file) or folder / file
 
 
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
-    """Reject a body that leaves its scan's box by more than 0.1 of its height, or is not 0.7 to 1.2 times as
-    tall, as when scale or translation were not applied."""
+    """Reject a body that exceeds its scan's box by more than 0.1 of its height, or is not 0.7 to 1.2 times as
+    tall, as happens if scale or translation are not applied."""
     points = np.concatenate([part.vertices for part in scan.parts])
     low = points.min(0)
     high = points.max(0)
@@ -149,8 +149,8 @@ class THuman2(Scans):
     val_fraction: Share = 0.19
     pixel_centers: Literal["half", "integer", "auto"] = "auto"
     fits: options.PathText | None = None
-    """Folder with <id>/smplx_param.pkl, mesh_smplx.obj;
-    null: by its usual names in or beside source."""
+    """Folder of <id>/smplx_param.pkl and mesh_smplx.obj; null: found by its usual names in or next to
+    source."""
 
     def scans(self) -> THuman2Source:
         return THuman2Source(self.source_folder, find_fits(self.source_folder, self.fits))

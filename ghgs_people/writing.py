@@ -1,4 +1,4 @@
-"""Files of a rendered subject, as :mod:`ghgs_lit.data.layout` reads them."""
+"""Write the files of a rendered subject in the layout of :mod:`ghgs_lit.data.layout`."""
 
 from pathlib import Path
 
@@ -7,22 +7,22 @@ from PIL import Image
 
 from ghgs_lit.data.view import View
 
-# Runs of equal bytes (Z_RLE of zlib): half the time of the default, and files are no larger.
+# zlib's Z_RLE: half the time of the default, with files no larger
 _PNG = {"compress_type": 3}
 
 
 def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
     """Write one view of a subject.
 
-    The JPEG keeps the full resolution of colours. The mask has three equal channels, as the
-    authors' loader reads channel 0.
+    The JPEG has full chroma resolution. The mask has three equal channels, of which the authors' loader
+    reads the first.
 
     Args:
         phase: folder of the phase, or a workspace.
         folder: name of the subject's position, ``<id>_<position>``.
-        number: of the view at its position.
-        view: image, mask and cameras; matte and inverse depth where there are any.
-        quality: of the JPEG, 1 to 100.
+        number: number of the view at its position.
+        view: image, mask and camera; matte and inverse depth are optional.
+        quality: quality of the JPEG, 1 to 100.
     """
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():
