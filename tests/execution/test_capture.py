@@ -110,7 +110,7 @@ def test_graphs_are_made_as_pytorch_documents(graphs):
 
 
 @pytest.mark.parametrize("end_fails", [True, False])
-def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails):
+def test_a_capture_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails):
     """PyTorch's context does not restore the stream if it cannot end a capture. Casts made meanwhile were
     not computed, and written memory is restored."""
     log, calls, weight = [], [], torch.ones(3)

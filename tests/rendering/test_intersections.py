@@ -133,7 +133,7 @@ def test_several_renderings_are_settled_together(capacities):
     assert len(calls) == 3
 
 
-def test_too_little_room_is_seen_also_when_played_back(capacities):
+def test_too_little_capacity_is_detected_on_replay(capacities):
     """On replay with other values, the needed numbers are updated in place."""
     with defer_checks() as rooms:
         drawn(size=0.01)

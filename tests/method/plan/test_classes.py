@@ -31,7 +31,7 @@ def rounding(monkeypatch):
     return switch
 
 
-def test_size_classes_add_an_eighth_at_most_and_are_few():
+def test_shape_buckets_add_an_eighth_at_most_and_are_few():
     """Every bucket holds its count; of 100,000 counts there are about eight per octave."""
     classes = [bucket_size(count) for count in range(1, 100_001)]
     assert all(count <= size <= count * 9 / 8 for count, size in enumerate(classes, start=1))

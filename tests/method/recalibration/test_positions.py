@@ -76,7 +76,7 @@ def test_the_gradient_is_that_of_finite_differences(scores, monkeypatch):
 
 
 @pytest.mark.parametrize("options", [{}, {"k": 0.3}], ids=["number", "share"])
-def test_rows_that_fill_up_a_size_class_say_nothing(options):
+def test_padding_of_a_shape_bucket_has_no_effect(options):
     """Padding of a shape bucket, as on a GPU, has no effect; one point is not finite."""
     tokens, points = scene(((16, 9, 3), (6, 2, 5)))
     tokens = double(tokens)
