@@ -1,34 +1,33 @@
-"""Lights around a person as photographs of real people have them: several of some size, whose
-shadows are soft, and light from all around, brighter from above. They are white and the same for
-every camera, so that views agree.
+"""Lights around a person, as in photographs of real people: several area lights with soft shadows, and
+ambient light that is brighter from above. They are white and the same for every camera, so that views are
+consistent.
 
-The light of each vertex of the mesh is computed once, for either side of the surface,
-and interpolated:
+The light at each vertex of the mesh is computed once, for both sides of the surface, and interpolated:
 
     (ambient (1 + sky n_y) + sum_l w_l mean_s visible(l, s) max(n . d_ls, 0)) ^ (1 / 2.2)
 
-over samples s of each light l. The power makes it a factor on texture values as stored. The
-exposure is that of a camera that measures the subject from all around."""
+over samples s of each light l. The power turns it into a factor on stored texture values. The exposure is
+that of a camera that meters the subject from all around."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-#: Exponent of the encoding of stored values: light is their 2.2th power.
+#: Gamma of stored values: light is their 2.2th power
 GAMMA = 2.2
-# Samples of each light.
+# Samples per light
 _SAMPLES = 12
-# Median of the mean brightness of 32 generated people at an exposure of 1.
+# Median of the mean brightness of 32 generated people at an exposure of 1
 _TYPICAL = 0.39
-# Those at the rim are tried first: the others are where these disagree.
+# Samples at the rim that are traced first; the others are traced only where these disagree
 _PROBED = 5
-# Angle between successive samples on a sunflower's spiral, which covers a disc evenly.
+# Angle between successive samples on a sunflower spiral, which covers a disc evenly
 _GOLDEN = np.pi * (3 - np.sqrt(5))
-# Distance in metres between a surface and the start of its rays to the lights.
+# Offset in metres of the origins of shadow rays from the surface
 _LIFT = 3e-3
 
-#: Tells of rays, given by origins and directions [n, 3] float32, which ones [n] hit the subject.
+#: Whether rays, given by origins and directions [n, 3] float32, hit the subject [n]
 Blocked = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -37,22 +36,22 @@ class Lights:
     """Ranges [least, greatest] from which lights are sampled."""
 
     count: tuple[int, int] = (2, 4)
-    ambient: tuple[float, float] = (0.25, 0.55)  # share of light from all around, 0 to 1
+    ambient: tuple[float, float] = (0.25, 0.55)  # fraction of ambient light, 0 to 1
     sky: tuple[float, float] = (
         0.1,
         0.7,
-    )  # by how much more of it comes from above than from the side, 0 to 1
+    )  # relative increase of ambient light from above compared with the side, 0 to 1
     radius: tuple[float, float] = (4.0, 25.0)  # angular radius of a light, degrees
     elevation: tuple[float, float] = (5.0, 60.0)  # of a light, degrees
-    contrast: float = 0.6  # relative variation of the strengths of the lights, 0 to below 1
+    contrast: float = 0.6  # relative variation of the lights' strengths, 0 to below 1
     brightness: float = 0.4  # mean of a typical subject, 1 for white
     spread: float = 0.12  # standard deviation of its logarithm, in addition to that between people
 
     def draw(self, rng: np.random.Generator) -> "LightRig":
-        """Draw the lights of one person: about evenly spaced in azimuth.
+        """Sample the lights of one person, roughly evenly spaced in azimuth.
 
         Args:
-            rng: draws number, places, sizes and strengths of the lights, and the brightness.
+            rng: samples number, positions, sizes and strengths of the lights, and the brightness.
         """
         count = int(rng.integers(self.count[0], self.count[1] + 1))
         azimuth = 2 * np.pi * (np.arange(count) + rng.uniform() + rng.uniform(-0.3, 0.3, count)) / count
@@ -86,10 +85,10 @@ class LightRig:
 
     Args:
         directions: [l, s, 3] float32 unit vectors towards samples of the lights.
-        strengths: [l] float32, light that each adds to a surface that faces it.
-        ambient: light from all around.
-        sky: by how much more of it comes from above than from the side, 0 to 1.
-        brightness: mean that a typical subject would have, 1 for white.
+        strengths: [l] float32, light that each adds to a surface facing it.
+        ambient: ambient light.
+        sky: relative increase of ambient light from above compared with the side, 0 to 1.
+        brightness: mean brightness that a typical subject would have, 1 for white.
         exposure: factor on stored values; None: not measured yet.
     """
 
@@ -101,12 +100,13 @@ class LightRig:
     exposure: float | None = None
 
     def exposed(self, brightness: float) -> "LightRig":
-        """Set the exposure, where it is not set: half of what a subject in dark or white
-        clothes differs from a typical one is taken back, as by a camera that measures subject
-        and surroundings.
+        """Set the exposure if it is not set.
+
+        It compensates half (in logarithms) of a subject's deviation from a typical brightness, such as
+        for dark or white clothes, like a camera that meters subject and surroundings.
 
         Args:
-            brightness: mean of the subject at an exposure of 1.
+            brightness: mean brightness of the subject at an exposure of 1.
         """
         return (
             self
@@ -120,15 +120,15 @@ class LightRig:
         normals: np.ndarray,
         is_blocked: Blocked,
     ) -> np.ndarray:
-        """Light on both sides of a surface, at an exposure of 1.
+        """Compute the light on both sides of a surface at an exposure of 1.
 
         Args:
-            points: [n, 3] float32 of the surface, metres.
+            points: [n, 3] float32, points of the surface, metres.
             normals: [n, 3] float32 unit vectors.
-            is_blocked: which rays hit the subject.
+            is_blocked: whether rays hit the subject.
 
         Returns:
-            Factors [n, 2] on stored values, on the side of the normals and on the other one.
+            Factors [n, 2] on stored values, on the side of the normals and on the other side.
         """
         sides = np.array([1, -1], np.float32)
         light = self.ambient * (1 + self.sky * normals[:, 1:2] * sides)
@@ -146,7 +146,7 @@ class LightRig:
 def _visible(
     points: np.ndarray, normals: np.ndarray, directions: np.ndarray, is_blocked: Blocked
 ) -> np.ndarray:
-    """Which samples [n, s] of a light are visible from points of a surface, on the side that faces them."""
+    """Visibility [n, s] of a light's samples from surface points, on the side facing each sample."""
     side = np.sign(normals @ directions.T)[..., None]
     origins = points[:, None] + np.float32(_LIFT) * side * normals[:, None]
     rays = np.broadcast_to(directions, origins.shape)

@@ -1,14 +1,13 @@
-"""Photographs of textured meshes: image, matte, mask and metric depth from pinhole cameras.
+"""Render image, matte, mask and metric depth of textured meshes from pinhole cameras.
 
-Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the
-subject's window.
+Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel that can show the subject.
 
-* image: the mean colour of the samples; samples that miss are black, so silhouettes are antialiased
-  and premultiplied by their coverage (like an alpha-blended splat on black);
-* matte: the share of a pixel's samples that hit the subject;
+* image: mean colour of the samples; samples that miss are black, so silhouettes are antialiased and
+  premultiplied by their coverage (like an alpha-blended splat on black);
+* matte: fraction of a pixel's samples that hit the subject;
 * mask: true where the matte is at least 0.5;
-* depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd),
-  0 where there is none. It is no mean of samples, so that no depth lies between two surfaces."""
+* depth: z of the hit nearest to the pixel's centre (at the centre itself if ``samples`` is odd), 0 without
+  a hit. It is not a mean of samples, so that no depth lies between two surfaces."""
 
 import importlib
 import platform
@@ -26,18 +25,17 @@ from ghgs_people.figures.meshing import smooth_normals
 from ghgs_people.lights import LightRig
 from ghgs_people.rig import Rig
 
-# Rays traced at once: they fit the processor's cache,
-# which is three times as fast as a whole photograph.
+# Rays traced at once; they fit into the processor's cache, three times as fast as a whole photograph
 _CHUNK = 1 << 14
-# Side in pixels of the photographs that the exposure is measured with, and factor on their light.
+# Side in pixels of the renderings that the exposure is measured from, and factor on their light
 _TRIAL = 64
 _DIM = 0.25
-# Brightness above which lit surfaces are compressed below 1, as cameras do.
+# Brightness above which highlights are compressed to below 1, as in cameras
 _KNEE = 0.8
 
 
 def _embree() -> tuple[ModuleType, ModuleType]:
-    """Modules of Embree, which some machines lack. InputError: it is not installed."""
+    """Import the modules of Embree, which has no wheel for some machines; raises InputError without it."""
     try:
         return tuple(map(importlib.import_module, ("embreex.rtcore_scene", "embreex.mesh_construction")))
     except ImportError:
@@ -50,12 +48,12 @@ def _embree() -> tuple[ModuleType, ModuleType]:
 
 @dataclass(frozen=True)
 class RenderedViews:
-    """Photographs from n cameras.
+    """Renderings from n cameras.
 
     Args:
         images: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
         alphas: [n, h, w] float32 in [0, 1].
-        depths: [n, h, w] float32, metres, 0 where ``alphas`` are.
+        depths: [n, h, w] float32, metres, 0 where ``alphas`` are 0.
     """
 
     images: np.ndarray
@@ -64,18 +62,18 @@ class RenderedViews:
 
     @property
     def masks(self) -> np.ndarray:
-        """[n, h, w] bool: at least half of a pixel shows the subject."""
+        """[n, h, w] bool, true where the subject covers at least half of the pixel."""
         return self.alphas >= 0.5
 
 
 class Studio:
-    """A person under fixed lights, photographed from any number of cameras.
+    """Renderer of a person under fixed lights.
 
     Surfaces are double-sided: normals are flipped towards the camera.
 
     Args:
-        person: to photograph, metres.
-        lights: around the person; None leaves textures as they are.
+        person: the person, metres.
+        lights: lights around the person; None: textures are rendered unlit.
         samples: each pixel is the mean of samples x samples rays; 1 to 16.
 
     Raises:
@@ -111,7 +109,7 @@ class Studio:
             self._light(normals)
 
     def _light(self, normals: np.ndarray) -> None:
-        """Compute the light of all corners, and expose; ``normals`` [n, 3] of vertices may be 0."""
+        """Compute the light at all corners and the exposure; ``normals`` [n, 3] of vertices may be 0."""
         corners, flat, _ = self._surface
         lost = ~normals.any(1)
         for corner in range(3):
@@ -122,7 +120,7 @@ class Studio:
         middle = (self._vertices.min(0) + self._vertices.max(0)) / 2
         around = Rig(radius=4 * tall, look_at=tuple(middle), pitch=0, focal=3, shift_y=0)
         cameras = around.cameras(np.arange(8) * 45.0, _TRIAL, _TRIAL)
-        corners[..., 2:] = (_DIM * light - 1)[self._faces]  # dim: no highlight is compressed
+        corners[..., 2:] = (_DIM * light - 1)[self._faces]  # dimmed so that no highlight is compressed
         trial = self.shoot(cameras)
         self.lights = self.lights.exposed(float(trial.images.mean() / trial.alphas.mean()) / _DIM)
         corners[..., 2:] = (self.lights.exposure * light - 1)[self._faces]
@@ -132,13 +130,13 @@ class Studio:
         return self._scene.run(origins, directions, query="OCCLUDED") >= 0
 
     def shoot(self, cameras: Cameras) -> RenderedViews:
-        """Photograph the person.
+        """Render the person.
 
         Args:
             cameras: n cameras, metres.
 
         Returns:
-            n photographs, black where there is no person.
+            n renderings on black.
 
         Raises:
             InputError: a camera is not finite or has a focal length <= 0.
@@ -160,7 +158,7 @@ class Studio:
     def _expose(
         self, matrix: np.ndarray, pose: np.ndarray, image: np.ndarray, alpha: np.ndarray, depth: np.ndarray
     ) -> None:
-        """Photograph the person with one camera: fills ``image``, ``alpha`` and ``depth`` (metres)."""
+        """Render the person from one camera into ``image``, ``alpha`` and ``depth`` (metres)."""
         n = self.samples
         knee = 1.0 if self.lights is None else _KNEE
         covered = np.zeros(alpha.shape, bool)

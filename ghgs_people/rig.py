@@ -159,13 +159,13 @@ class Rig:
     def drawn(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
     ) -> tuple["Rig", Poses]:
-        """Draw the rig of one subject by ``variation``, and the deviations of its cameras.
+        """Sample the rig of one subject and the deviations of its cameras from ``variation``.
 
         Args:
             person: the placed subject, metres.
             yaws: degrees [positions, 5] of all its views (:meth:`yaws`).
             aspect: width / height of the images.
-            rng: for the rig alone; the same numbers are sampled whatever varies.
+            rng: used only for the rig; samples the same numbers for every ``variation``.
 
         Returns:
             The rig without variation, and the deviations [positions, 5] of its cameras.

@@ -1,5 +1,4 @@
-"""Scans: textured meshes, as ``.obj`` like those of THuman2.0,
-or as ``.glb`` with several parts."""
+"""Read scans: textured meshes as ``.obj`` (like those of THuman2.0) or ``.glb`` with several parts."""
 
 import io
 import json
@@ -22,33 +21,25 @@ from ghgs_people.figures.mesh import Person, TexturedMesh
 log = logging.getLogger(__name__)
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
-#: Options of map_Kd that move or scale an image, except for those without effect.
+#: Options of map_Kd that move, scale or clamp an image, except those without effect
 _MOVES = r"(-\w+ \S+ )*-(s(?! 1(\.0*)? 1(\.0*)? )|o(?! 0(\.0*)? 0(\.0*)? )|t|clamp on) "
-#: Extensions without which a mesh can be read, though a file may require them.
+#: Required extensions of a file that can be ignored
 _READ_EXTENSIONS = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
-_FLOAT = 5126  #: Numbers of a glTF accessor that trimesh reads as coordinates of textures
+_FLOAT = 5126  #: glTF component type that trimesh can read for texture coordinates
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
 @dataclass(frozen=True)
 class ScanSource:
-    """A folder ``<folder>/<id>/<id>.obj`` (with its ``material0.jpeg``) or
-    ``<folder>/<id>/<id>.glb``.
-
-    Args:
-        folder: of the scans.
-    """
+    """Folder of scans ``<id>/<id>.obj`` (with ``material0.jpeg``) or ``<id>/<id>.glb``."""
 
     folder: Path
 
     def names(self) -> list[str]:
-        """List the scans; a folder whose meshes have other names is logged.
-
-        Returns:
-            Ids, sorted.
+        """List the sorted ids of scans; folders whose meshes have other names are logged.
 
         Raises:
-            InputError: the folder is missing or holds no scans.
+            InputError: the folder is missing or contains no scans.
         """
         require_folder(self.folder, "a folder of scans")
         folders = [p for p in self.folder.iterdir() if p.is_dir() and not p.name.startswith(".")]
@@ -84,7 +75,7 @@ class ScanSource:
         return Person(name=name, parts=load_parts(path), body_vertices=body)
 
     def facing(self, name: str) -> float:
-        """0 degrees: it is not known where these scans face."""
+        """0 degrees, since the direction that these scans face is unknown."""
         return 0.0
 
 
@@ -98,25 +89,25 @@ def _has_meshes(folder: Path) -> bool:
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
-    """Files that a mesh names, as any system spells them: an MTL file, textures, buffers;
-    and ``moved``, a texture that its MTL file moves, scales or does not repeat."""
+    """Resolver of the files that a mesh refers to (MTL, textures, buffers), in any system's spelling.
+
+    ``moved`` is a texture that the MTL file moves, scales or clamps."""
 
     moved = ""
 
     def get(self, key: str) -> bytes:
-        """Read a file; one that is named with folders of another machine lies next to the mesh.
+        """Read a file; one with a path of another machine is searched next to the mesh.
 
         Args:
-            key: its name, as the mesh spells it.
+            key: name of the file in the mesh.
 
         Raises:
-            FileNotFoundError: there is none.
+            FileNotFoundError: there is no such file.
         """
         name = str(key).strip().strip('"')
         self.moved = self.moved or (name if re.match(_MOVES, name) else "")
         folder = Path(self.parent)
-        # Escapes of a URI, folders of another machine, and options of map_Kd,
-        # which stand before the name.
+        # Names may have URI escapes, folders of another machine, or options of map_Kd in front.
         for spelling in (name, unquote(name), split_path(name)[-1], *name.split()[-1:]):
             path = find_path(folder, spelling) if spelling else None
             if path is not None and path.is_file():
@@ -128,7 +119,7 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     """Read all textured meshes of a file in its world frame.
 
     Args:
-        path: of an ``.obj``, ``.glb`` or ``.gltf`` file.
+        path: an ``.obj``, ``.glb`` or ``.gltf`` file.
 
     Raises:
         InputError: the file cannot be read, has no triangles, is rigged or compressed,
@@ -144,7 +135,7 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
             scene = trimesh.load_scene(io.BytesIO(content), kind, beside, process=False)
     except InputError:
         raise
-    except Exception as error:  # trimesh raises whatever its parsers raise
+    except Exception as error:  # trimesh lets any exception of its parsers through
         raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error
     require(not beside.moved, str(path), "map_Kd without -s, -o, -t and -clamp", beside.moved)
     parts = []
@@ -193,7 +184,7 @@ def _check_gltf(path: Path, content: bytes) -> None:
 def _part(
     path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray, is_alone: bool
 ) -> TexturedMesh:
-    """Textured mesh in the world of one that trimesh has read."""
+    """Convert trimesh's mesh to a textured mesh in the file's world frame."""
     texture = _texture(path, getattr(mesh.visual, "material", None), is_alone)
     if texture is None:
         raise InputError(f"{path}: expected a texture for the mesh {name!r}; found none")
@@ -209,13 +200,13 @@ def _part(
 
 
 def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
-    """Texture [h, w, 3] uint8 of a material, or None; a file's only mesh may take an image next to it."""
+    """Texture [h, w, 3] uint8 of a material, or None; the only mesh of an OBJ may use an image next to it."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    # not from a file: trimesh replaced a missing material
+    # without a format: trimesh's substitute for a missing material
     if image is not None and image.format is None:
         image = None
     factor = getattr(material, "baseColorFactor", None)
-    if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
+    if image is None and factor is not None:  # a plain colour, common for buttons and eyes
         return np.asarray(factor, np.uint8).reshape(1, 1, -1)[..., :3]
     if image is None and is_alone and path.suffix.lower() == ".obj":
         image = _image_beside(path)
@@ -230,7 +221,7 @@ def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
 
 
 def _image_beside(path: Path) -> Image.Image | None:
-    """The texture of a scan without its ``.mtl``: ``material0.*``, or the only image."""
+    """Texture of a scan without ``.mtl``: ``material0.*``, or the only image next to it."""
     images = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
     named = [p for p in images if p.stem.lower() == "material0"]
     chosen = named[:1] or (images if len(images) == 1 else [])

@@ -1,12 +1,11 @@
-"""Frozen people of ``data=synthetic``: the same ones for all measurements, and for no training.
+"""Frozen people of ``data=synthetic``: the same for all measurements, never used in training.
 
-``split=bench`` compares methods during development; ``split=sealed`` is for published figures only,
-not for choices. ``<split>.json`` defines them: numbers of the people, seed, cameras, lights, rays.
-The code that generates people may change, so ``<split>.npz`` has thumbnails: 16 x 16 pixels of two
-photographs and masks of each person. These are compared within a tolerance: processors round rays
-and JPEG files differently and people can be rendered at any size, so a digest of the photographs
-would not match. After a change of how they look, a new version must be baked
-(``scripts/bake_bench.py``)."""
+``split=bench`` compares methods during development; ``split=sealed`` is for published figures only, not
+for choices. ``<split>.json`` defines numbers of people, seed, cameras, lights and rays. Since the code that
+generates people may change, ``<split>.npz`` contains thumbnails: 16 x 16 pixels of two photographs and
+masks of each person. They are compared within a tolerance, not by a digest of the photographs: processors
+round rays and JPEG files differently, and people can be rendered at any size. After a change of their
+appearance, a new version must be baked (``scripts/bake_bench.py``)."""
 
 import hashlib
 import json
@@ -25,43 +24,30 @@ from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 
 SPLITS = ("bench", "sealed")
-#: First letters of names: people who stand or walk, and people in poses of sport and dance.
+#: First letters of names of people who stand or walk, and of people in poses of sport and dance
 KINDS = {"people": "p", "active": "a"}
 FOLDER = Path(__file__).parent
-#: Ring positions of the photographs that are compared: front and back.
+#: Ring positions of the compared photographs: front and back
 POSITIONS = (0, 8)
 SIDE = 16
-#: Largest root mean square difference of two thumbnails, of 255 levels, at the size of the stored
-#: ones (it is 0 on the machine that made them).
+#: Largest root mean square difference of two thumbnails, in levels of 255, at the size of the stored ones
+#: (0 on the machine that rendered them)
 SAME_SIZE = 0.3
-#: The same at other sizes (it is 6.8 at 56 pixels).
+#: The same at other sizes (6.8 at 56 pixels)
 OTHER_SIZE = 8.0
-#: Smallest longer side in pixels at which people can be told apart.
+#: Least longer side in pixels at which people can be distinguished
 LEAST = 56
 
 
 @cache
 def definition(split: str) -> dict[str, Any]:
-    """Read the definition of the people of a split.
-
-    Args:
-        split: one of ``SPLITS``.
-
-    Returns:
-        The content of ``<split>.json``, as plain data.
-    """
+    """Read ``<split>.json``, the definition of the people of a split (one of ``SPLITS``)."""
     return json.loads((FOLDER / f"{split}.json").read_text())
 
 
 def names(split: str) -> list[str]:
-    """Name the subjects of a split, in the order of its thumbnails.
-
-    Args:
-        split: one of ``SPLITS``.
-
-    Returns:
-        Names as ``p2000000``: the letter of the kind and the number of the person.
-    """
+    """Names of a split's subjects, in the order of its thumbnails, such as ``p2000000``: the letter of the
+    kind and the number of the person."""
     defined = definition(split)
     listed = []
     for kind, letter in KINDS.items():
@@ -73,9 +59,6 @@ def names(split: str) -> list[str]:
 def thumbnails(split: str) -> np.ndarray:
     """Read the stored thumbnails of a split.
 
-    Args:
-        split: one of ``SPLITS``.
-
     Returns:
         [people, positions, SIDE, SIDE, 4] uint8: colours and mask, positions as in ``POSITIONS``.
     """
@@ -84,14 +67,10 @@ def thumbnails(split: str) -> np.ndarray:
 
 @cache
 def facts(split: str) -> dict[str, str]:
-    """Say which version of a split was measured, for results.
-
-    Args:
-        split: one of ``SPLITS``.
+    """Version of a split, for results.
 
     Returns:
-        Version and first 12 digits of the SHA-256 of definition and thumbnails,
-        by the name of the split.
+        Version and first 12 digits of the SHA-256 of definition and thumbnails, by name of the split.
     """
     defined = json.dumps(definition(split), sort_keys=True).encode()
     digest = hashlib.sha256(defined + thumbnails(split).tobytes()).hexdigest()
@@ -99,17 +78,16 @@ def facts(split: str) -> dict[str, str]:
 
 
 def check_settings(split: str, settings: Mapping[str, Any]) -> None:
-    """Refuse settings of ``data`` that differ from the definition.
-
-    Those that it does not name, such as the size, are free.
+    """Check that settings of ``data`` match the definition; others, such as the size, are free.
 
     Args:
         split: one of ``SPLITS``.
-        settings: of the data set, as nested plain data;
-            ``render.size`` is [height, width] in pixels.
+        settings: settings of the data set as nested plain data; ``render.size`` is [height, width] in
+            pixels.
 
     Raises:
-        InputError: names the first key that differs; or the longer side is below ``LEAST`` pixels.
+        InputError: a setting differs (the message names the first key), or the longer side is below
+            ``LEAST`` pixels.
     """
     given = flatten(json.loads(json.dumps(settings)))  # tuples to lists
     size = max(settings["render"]["size"])
@@ -120,29 +98,26 @@ def check_settings(split: str, settings: Mapping[str, Any]) -> None:
 
 
 def thumbnail(view: View) -> np.ndarray:
-    """Shrink a photograph of any size.
-
-    Args:
-        view: image and mask.
+    """Downsample a photograph and its mask.
 
     Returns:
         [SIDE, SIDE, 4] uint8: colours and mask, each pixel the mean of its box.
     """
     picture = Image.fromarray(np.dstack((view.image, view.mask.astype(np.uint8) * 255)), "RGBA")
-    # Each band by itself: PIL would weight colours by the mask.
+    # Each band separately, since PIL would weight colours by the mask.
     bands = [band.resize((SIDE, SIDE), Image.Resampling.BOX) for band in picture.split()]
     return np.stack([np.asarray(band) for band in bands], -1)
 
 
 def check_photographs(split: str, reader: Reader) -> None:
-    """Refuse photographs that do not show the people of the definition.
+    """Check that photographs show the people of the definition.
 
     Args:
         split: one of ``SPLITS``.
-        reader: of some or all of :func:`names`.
+        reader: reader of some or all of :func:`names`.
 
     Raises:
-        InputError: names the first person whose photographs differ.
+        InputError: a person's photographs differ; the message names the first one.
     """
     defined = definition(split)
     known = dict(zip(names(split), thumbnails(split), strict=True))

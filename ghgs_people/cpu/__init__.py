@@ -1,1 +1,1 @@
-"""Photographs on cores: kernels that Numba compiles."""
+"""CPU kernels of the renderer, compiled by Numba."""

@@ -1,8 +1,6 @@
-"""The kernels of photographs on cores: which pixels can show the subject, rays through them,
-colours of hits.
+"""CPU kernels of the renderer: pixels that can show the subject, rays through them, colours of hits.
 
-Sums have the order and the precision of the formulas in NumPy,
-so that results are bit-equal to them."""
+Sums have the order and precision of the formulas in NumPy, so that results are bit-equal to them."""
 
 import math
 
@@ -13,9 +11,9 @@ from ghgs_lit.ops.compile import FLOATS, NUMBER, helper, kernel_for
 
 ZERO, HALF, ONE = (np.float32(x) for x in (0, 0.5, 1))
 LEVELS = np.arange(256, dtype=np.float32) / np.float32(255)
-# Pixels around the box of a projected triangle, more than what rays and projections round.
+# Margin in pixels around the box of a projected triangle, larger than rounding errors
 MARGIN = 0.0625
-# Depth in metres below which projections have no bounds.
+# Depth in metres below which projections are unbounded
 NEAR = 1e-3
 
 
@@ -40,7 +38,7 @@ def cover(vertices, faces, matrix, pose, covered):
         faces: [m, 3].
         matrix: intrinsics [3, 3], pixels.
         pose: extrinsics [4, 4], world to camera, metres.
-        covered: [h, w] false; all pixels become true where a vertex is not before the camera.
+        covered: [h, w], initially false; all pixels become true if a vertex is not in front of the camera.
     """
     height, width = covered.shape
     columns = np.empty(len(vertices))
@@ -53,7 +51,7 @@ def cover(vertices, faces, matrix, pose, covered):
         if c <= NEAR:
             covered[:] = True
             return
-        # Far outside of the image is outside: whole numbers stay small.
+        # Clamped so that integers stay small.
         columns[i] = min(max((matrix[0, 0] * a + matrix[0, 1] * b) / c + matrix[0, 2], -9.0), width + 9.0)
         rows[i] = min(max(matrix[1, 1] * b / c + matrix[1, 2], -9.0), height + 9.0)
     for f in range(len(faces)):
@@ -69,16 +67,15 @@ def cover(vertices, faces, matrix, pose, covered):
 
 @kernel_for(_PLACES, NUMBER, NUMBER, _DOUBLES[2], _DOUBLES[2], FLOATS[2])
 def aim(pixels, width, samples, matrix, pose, rays):
-    """Rays through pixels. Before the camera's rotation they have z = 1,
-    so that distances are depths.
+    """Compute rays through pixels, with z = 1 in the camera's frame, so that distances are depths.
 
     Args:
         pixels: [p], row * width + column.
-        width: of the image, pixels.
+        width: width of the image, pixels.
         samples: s; each pixel has s x s rays on a regular grid.
         matrix: intrinsics [3, 3], pixels.
         pose: extrinsics [4, 4], world to camera.
-        rays: [p * s * s, 3], filled with directions in the world, those of a pixel by rows.
+        rays: output [p * s * s, 3], directions in the world, those of a pixel by rows.
     """
     n = 0
     for p in range(len(pixels)):
@@ -96,35 +93,23 @@ def aim(pixels, width, samples, matrix, pose, rays):
 
 @helper
 def _between(a, b, c, d, shares):
-    """Mean of four texels, 0 to 255, by their shares."""
+    """Mean of four texels, 0 to 255, weighted by ``shares``."""
     return shares[0] * LEVELS[a] + shares[1] * LEVELS[b] + shares[2] * LEVELS[c] + shares[3] * LEVELS[d]
 
 
 @helper
 def _mixed(corners, face, weights, k):
-    """An attribute where a ray hits a face, mixed from those of its corners.
+    """Interpolate attribute ``k`` (0 to 3) at a hit with barycentric ``weights``.
 
-    Args:
-        corners: [m, 3, 4], u and v of the texture, and light before and behind each corner, less 1.
-        face: index of the face.
-        weights: barycentric coordinates of the hit.
-        k: index of the attribute, 0 to 3.
-    """
+    ``corners`` [m, 3, 4] has u and v of the texture, and light minus 1 in front and behind each corner."""
     first, second, third = weights
     return first * corners[face, 0, k] + second * corners[face, 1, k] + third * corners[face, 2, k]
 
 
 @helper
 def _light(surface, face, weights, rays, n):
-    """Factor on the texture of a hit on the side that the ray comes from.
-
-    Args:
-        surface: corners as in :func:`_mixed`, unit normals [m, 3] of the faces.
-        face: index of the face.
-        weights: barycentric coordinates of the hit.
-        rays: [r, 3], directions.
-        n: index of the ray.
-    """
+    """Factor on the texture at a hit, on the side that ray ``n`` comes from; ``surface`` has corners as in
+    :func:`_mixed` and unit normals [m, 3] of the faces."""
     corners, flat, _ = surface
     along = flat[face, 0] * rays[n, 0] + flat[face, 1] * rays[n, 1] + flat[face, 2] * rays[n, 2]
     return ONE + _mixed(corners, face, weights, 3 if along > ZERO else 2)
@@ -132,17 +117,17 @@ def _light(surface, face, weights, rays, n):
 
 @helper
 def _compressed(value, knee):
-    """A brightness below 1: above the knee its slope falls, from 1."""
+    """Compress a brightness to below 1, with a decreasing slope above the knee."""
     return value if value <= knee else ONE - (ONE - knee) * (ONE - knee) / (value - (knee + knee - ONE))
 
 
 @helper
 def _color(surface, textures, face, weights):
-    """Bilinear values of a repeating texture at a hit, 0 to 1.
+    """Bilinear sample of a repeating texture at a hit, 0 to 1.
 
     Args:
         surface: corners as in :func:`_mixed`, normals, and the part [m] of each face.
-        textures: texels [t, 3] of all parts; first texel, height and width [k, 3] of each.
+        textures: texels [t, 3] of all parts; first texel, height and width [k, 3] of each part.
         face: index of the face.
         weights: barycentric coordinates of the hit.
     """
@@ -175,7 +160,7 @@ def _color(surface, textures, face, weights):
     _PLACES, _PLACES, FLOATS[2], _HITS, _SURFACE, _TEXTURES, types.float32, FLOATS[2], FLOATS[1], FLOATS[1]
 )
 def expose(pixels, order, rays, hits, surface, textures, knee, image, matte, depth):
-    """Develop pixels from what their rays hit.
+    """Compute pixels from the hits of their rays.
 
     Args:
         pixels: [p], indices of pixels.
@@ -184,10 +169,10 @@ def expose(pixels, order, rays, hits, surface, textures, knee, image, matte, dep
         hits: face [p * s] (-1: none), second and third barycentric coordinate, distance.
         surface: corners, normals and parts of the faces, as in :func:`_light` and :func:`_color`.
         textures: as in :func:`_color`.
-        knee: brightness above which highlights are compressed; 1: they are cut off.
-        image: [h * w, 3], gets the mean colour of the samples; those that miss are black.
-        matte: [h * w], gets the share of samples that hit.
-        depth: [h * w], gets the distance of the hit nearest to the pixel's centre.
+        knee: brightness above which highlights are compressed; 1: they are clipped.
+        image: output [h * w, 3], mean colour of the samples, with black for those that miss.
+        matte: output [h * w], fraction of samples that hit.
+        depth: output [h * w], distance of the hit nearest to the pixel's centre.
     """
     faces, us, vs, distances = hits
     samples = len(order)
