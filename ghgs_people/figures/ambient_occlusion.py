@@ -1,10 +1,9 @@
-"""Ambient occlusion: how much of the light from all around reaches a point past the
-person's own body.
+"""Ambient occlusion of a person by their own body and the ground.
 
-The body is approximated by spheres inside trunk and limbs, because the share of light that a sphere
-blocks has a closed form (about cos(angle) (radius / distance)^2). Folds and hollows finer than the
-spheres are found by the distance between the surface and a smoothed copy of it. Both are smooth
-functions of the points, unlike an estimate from random rays.
+The body is approximated by spheres inside trunk and limbs, because the fraction of light that a sphere
+blocks has a closed form (about cos(angle) (radius / distance)^2). Folds and hollows finer than the spheres
+are found from the distance between the surface and a smoothed copy of it. Both are smooth functions of the
+points, unlike an estimate from random rays.
 """
 
 import numpy as np
@@ -21,8 +20,8 @@ CHAINS = (  # from joint, to joint, number of spheres
 )  # fmt: skip
 TRUNK = ("root", "spine05", "spine04", "spine03", "spine02", "spine01", "neck01", "neck03", "head")
 Spheres = tuple[np.ndarray, np.ndarray]  # centres [s, 3], radii [s], metres
-STRENGTH = 0.75  # of the shadows of spheres
-HOLLOW = 45.0  # share of the light that a hollow loses per metre of depth
+STRENGTH = 0.75  # strength of the shadows of spheres
+HOLLOW = 45.0  # fraction of the light that a hollow loses per metre of depth
 
 
 def occluding_spheres(figure: Figure) -> Spheres:
@@ -60,7 +59,7 @@ def occluding_spheres(figure: Figure) -> Spheres:
 
 
 def visibility(points: np.ndarray, normals: np.ndarray, spheres: Spheres) -> np.ndarray:
-    """Share of the surroundings, weighted by the cosine, that spheres and the ground do not hide.
+    """Fraction of the surroundings, weighted by the cosine, that spheres and the ground do not hide.
 
     Args:
         points: [g, 3], metres, the ground at y = 0.
@@ -86,7 +85,7 @@ def ambient_occlusion(piece: Chart, points: np.ndarray, spheres: Spheres) -> np.
     Args:
         piece: the chart.
         points: its points [g, 3] in the pose, metres.
-        spheres: of the body, in the pose.
+        spheres: spheres of the body, in the pose.
 
     Returns:
         Factor [g] on the colours, slightly above 1 on ridges.

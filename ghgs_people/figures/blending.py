@@ -1,18 +1,18 @@
-"""Soft masks, and colours mixed by them."""
+"""Soft masks, and blending of colours with them."""
 
 import numpy as np
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """Go from 0 to 1, with a slope of 0 at both ends.
+    """Smooth step from 0 to 1, with slope 0 at both ends.
 
     Args:
-        low: where it is 0, as it is beyond; above ``high`` for a falling step.
-        high: where it is 1, as it is beyond.
+        low: value of ``x`` up to which the result is 0; above ``high`` for a falling step.
+        high: value of ``x`` from which the result is 1.
         x: any shape.
 
     Returns:
-        3 t^2 - 2 t^3 of the shape of ``x``, t being the share of the way from ``low`` to ``high``.
+        3 t^2 - 2 t^3 in the shape of ``x``, where t goes from 0 at ``low`` to 1 at ``high``.
     """
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3 - 2 * t)
@@ -23,8 +23,8 @@ def bump(x: np.ndarray, centre: float, width: float) -> np.ndarray:
 
     Args:
         x: any shape.
-        centre: where it is 1.
-        width: where it has fallen to 1 / e; beyond two widths it is nearly 0.
+        centre: position of the maximum, 1.
+        width: distance from the centre at which it is 1 / e.
     """
     return np.exp(-(((x - centre) / width) ** 2))
 
@@ -49,7 +49,7 @@ def darken(colour: np.ndarray, mask: np.ndarray, amount: float) -> np.ndarray:
     Args:
         colour: [k, 3].
         mask: [k] in [0, 1].
-        amount: share of the light that is taken away there, 0 to 1.
+        amount: fraction of the light that is removed there, 0 to 1.
 
     Returns:
         [k, 3].

@@ -1,4 +1,4 @@
-"""The body model: shapes as principal components, a rig, linear blend skinning.
+"""Body model: shapes as principal components, a skeleton, linear blend skinning.
 
 The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), converted by
 ``scripts/bake_body.py``. Metres, y up, facing +z; the person's left is +x. At rest the feet stand
@@ -28,7 +28,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class BodyModel:
-    """The body model as stored in the asset."""
+    """Body model as stored in the asset."""
 
     # [n + b, 3] float64, the n vertices and then the b joints of the average adult at rest
     mean: np.ndarray
@@ -61,10 +61,10 @@ class BodyModel:
         return self.bone_names.index(name)
 
     def rest(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A shape at rest, the lowest point of the skin on y = 0.
+        """Compute a shape at rest, with the lowest point of the skin on y = 0.
 
         Args:
-            coefficients: [k] of the principal components.
+            coefficients: [k], coefficients of the principal components.
 
         Returns:
             Vertices [n, 3] and joints [b, 3], metres.
@@ -74,13 +74,13 @@ class BodyModel:
         return points[: self.vertex_count], points[self.vertex_count :]
 
     def sample_shape(self, rng: np.random.Generator) -> tuple[np.ndarray, bool, float]:
-        """Draw an adult between two stored ones of one sex.
+        """Sample an adult by interpolation between two stored ones of the same sex.
 
         Args:
-            rng: draws sex, the two adults and the share of each.
+            rng: samples sex, the two adults and their weights.
 
         Returns:
-            Coefficients [k], whether female, and age from 0.67 (young) to 1 (old).
+            Coefficients [k], true if female, and age from 0.67 (young) to 1 (old).
         """
         female = bool(rng.random() < 0.5)
         pool = np.flatnonzero(self.female == female)
@@ -92,7 +92,7 @@ class BodyModel:
 
 @lru_cache(maxsize=1)
 def load_body() -> BodyModel:
-    """Read the asset in the folder of this module, once per process."""
+    """Read the asset of this package, once per process."""
     with as_file(files("ghgs_people.figures") / "assets" / "body.npz") as path, np.load(path) as data:
         asset = {name: data[name] for name in data.files}
     weights = np.zeros((len(asset["weights"]), len(asset["bone_names"])))
@@ -146,8 +146,8 @@ def skin(vertices: np.ndarray, weights: np.ndarray, transforms: np.ndarray) -> n
 
     Args:
         vertices: [n, 3] at rest, metres.
-        weights: [n, b] of the bones, rows sum to 1.
-        transforms: [b, 3, 4] of the bones from rest to pose.
+        weights: [n, b] skinning weights, rows sum to 1.
+        transforms: [b, 3, 4], transforms of the bones from rest to pose.
 
     Returns:
         [n, 3] in the pose.

@@ -1,7 +1,6 @@
-"""UV charts of the base mesh: the parts of body and garments that share one texture.
+"""UV charts of the base mesh: parts of body and garments that share one texture.
 
-Points and texels of a chart know their place on the average body
-(:mod:`ghgs_people.figures.place`).
+Each point and texel of a chart has a place on the average body (:mod:`ghgs_people.figures.place`).
 """
 
 from collections.abc import Sequence
@@ -42,10 +41,10 @@ class Chart:
     texel_shares: np.ndarray  # [k, 3] its barycentric coordinates there
 
     def image(self, colours: np.ndarray) -> np.ndarray:
-        """Make a texture of the colours of its covered texels; others copy the nearest.
+        """Create a texture from the colours of its covered texels; other texels copy the nearest one.
 
         Args:
-            colours: [k, 3], 0 to 1.
+            colours: [k, 3] in [0, 1].
 
         Returns:
             [h, w, 3] uint8.
@@ -57,7 +56,7 @@ class Chart:
 
         Args:
             texture: [h, w, 3] uint8.
-            factor: [g] at the points, at least 0.
+            factor: [g], factor at each point, at least 0.
 
         Returns:
             [h, w, 3] uint8.
@@ -67,11 +66,11 @@ class Chart:
         return np.rint(np.minimum(texture * spread, 255)).astype(np.uint8)
 
     def mesh(self, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
-        """Cut the surface out.
+        """Cut the surface along the zero line of a field.
 
         Args:
             points: [g, 3], metres.
-            field: [g], positive where the surface stays.
+            field: [g], positive where the surface is kept.
             texture: [h, w, 3] uint8.
         """
         faces, a, b, t = clip(self.faces, field[self.point_of_vertex])
@@ -82,10 +81,10 @@ class Chart:
 
 @dataclass(frozen=True)
 class _Recipe:
-    """How a chart is built.
+    """Parameters of a chart.
 
-    `shape` is the height and width of the texture; quads are subdivided `levels` times, points
-    smoothed `smoothing` and skinning weights `blending` times.
+    `shape` is the height and width of the texture; quads are subdivided `levels` times, points are smoothed
+    `smoothing` times and skinning weights `blending` times.
     """
 
     shape: tuple[int, int]
@@ -167,21 +166,21 @@ def chart(name: str) -> Chart:
 
 
 def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
-    """Choose the quads of a chart.
+    """Select the quads of a chart.
 
     Args:
         body: the base mesh.
         name: one of `RECIPES`.
 
     Returns:
-        The quads, and the box (left, bottom, right, top) in the UV layout that the texture shows.
+        The quads, and the box (left, bottom, right, top) of the texture in the UV layout.
     """
     surface = body.surfaces["body"]
     margin = 0.0
     if name in ("head", "skin"):
         uv = _cropped(body.uv, body.head_uv)
         inside = ((uv > 0) & (uv < 1)).all(1)[surface.uv_quads].all(1)
-        inside &= body.mean[surface.quads][..., 1].min(1) > 1.38  # the box also holds fingers
+        inside &= body.mean[surface.quads][..., 1].min(1) > 1.38  # the box also contains fingers
         return (surface[inside], body.head_uv) if name == "head" else (surface[~inside], (0, 0, 1, 1))
     if name == "scalp":
         above = hairline(body.mean[: body.vertex_count])[surface.quads]
@@ -206,7 +205,7 @@ def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
 
 
 def _cropped(uv: np.ndarray, box: Sequence[float]) -> np.ndarray:
-    """UV relative to a box (left, bottom, right, top)."""
+    """UV coordinates relative to a box (left, bottom, right, top)."""
     left, bottom, right, top = box
     return (uv - [left, bottom]) / [right - left, top - bottom]
 

@@ -1,4 +1,4 @@
-"""Colours of a person, and textures of head, skin and eyes."""
+"""Colours of a person's skin, hair and eyes, and textures of head, skin and eyes."""
 
 from dataclasses import dataclass
 
@@ -38,12 +38,11 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Complexion:
-    """Draw the colours of a person: with dark skin hair and eyes are dark,
-    with age hair turns grey.
+    """Sample the colours of a person: dark skin comes with dark hair and eyes, and hair turns grey with age.
 
     Args:
-        rng: draws everything.
-        female: whether there may be makeup; a beard otherwise.
+        rng: samples everything.
+        female: allows makeup; otherwise a beard.
         age: from 0.67 (young) to 1 (old).
     """
     tone = rng.uniform(0, len(SKINS) - 1)
@@ -92,12 +91,12 @@ def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Com
 def _blob(
     point: np.ndarray, centre: tuple[float, float, float], size: tuple[float, float, float]
 ) -> np.ndarray:
-    """A soft spot of the face, on both sides.
+    """Mask of a soft spot on both sides of the face.
 
     Args:
         point: [k, 3], metres, in the frame of :func:`.place.face_frame`.
-        centre: of the left spot, metres.
-        size: along x, y and z, metres; there it has fallen to 1 / e.
+        centre: centre of the left spot, metres.
+        size: distance along x, y and z at which the mask is 1 / e, metres.
 
     Returns:
         [k], 1 at the centre, 0 far away.
@@ -107,7 +106,7 @@ def _blob(
 
 
 def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
-    """Factor [k] on the colours of points [k, 3] of the skin: fine and coarse spots."""
+    """Factor [k] on the colours of skin points [k, 3], for fine and coarse spots."""
     u = point[:, 0] + 0.5 * point[:, 2]
     v = point[:, 1] + 0.3 * point[:, 2]
     return 1 + 0.030 * look.noise(u / 0.45, v / 0.45) + 0.018 * look.fine(u / 0.12, v / 0.12)
@@ -158,7 +157,7 @@ def head_texture(look: Complexion, scalp: float) -> np.ndarray:
 
 
 def _masks(piece: Chart) -> np.ndarray:
-    """Masks [k, 3] of lips, eyelids and ears, 0 to 1, of the head's texels."""
+    """Masks [k, 3] of lips, eyelids and ears, 0 to 1, for the head's texels."""
     return load_body().head_masks.reshape(-1, 4)[piece.texels, :3] / 255.0
 
 
@@ -235,7 +234,7 @@ def skin_texture(look: Complexion, shoes: Shoes) -> np.ndarray:
 
     Args:
         look: colours of the person.
-        shoes: with the socks.
+        shoes: the shoes, with their socks.
 
     Returns:
         Texture [h, w, 3] uint8.

@@ -1,5 +1,5 @@
-"""Colours of cloth: weaves, patterns and prints as functions of metres along and
-around the body."""
+"""Colours of cloth: weaves, patterns and prints as functions of position along and around the body, in
+metres."""
 
 import colorsys
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from ghgs_people.figures.blending import mix, smoothstep
 from ghgs_people.figures.noise import Noise
 
-PATTERNS = {  # how often each is drawn, relative to the others
+PATTERNS = {  # relative frequencies
     "plain": 5.0, "melange": 2.0, "knit": 1.5, "stripes": 2.5, "pinstripes": 1.0, "checks": 2.0,
     "gingham": 1.0, "dots": 1.2, "blobs": 1.5, "camouflage": 0.7, "block": 1.4, "gradient": 0.6,
     "zigzag": 0.7, "argyle": 0.7,
@@ -21,11 +21,11 @@ NEUTRALS = (
 
 
 def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
-    """Draw a colour of clothes.
+    """Sample a colour of clothes.
 
     Args:
-        rng: draws it.
-        neutral: probability of greys, navy and browns.
+        rng: samples it.
+        neutral: probability of grey, navy or brown.
 
     Returns:
         [3] in [0, 1].
@@ -39,7 +39,7 @@ def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Fabric:
-    """A pattern in up to three colours."""
+    """A pattern with up to three colours."""
 
     pattern: str
     colours: np.ndarray  # [3, 3] in [0, 1]
@@ -51,11 +51,11 @@ class Fabric:
 
 
 def sample_fabric(rng: np.random.Generator, patterns: tuple[str, ...] | None = None) -> Fabric:
-    """Draw a fabric.
+    """Sample a fabric.
 
     Args:
-        rng: draws everything.
-        patterns: names of `PATTERNS` to choose from; None: any.
+        rng: samples everything.
+        patterns: allowed names of `PATTERNS`; None: all.
     """
     names = tuple(patterns or PATTERNS)
     weights = np.array([PATTERNS[name] for name in names])
@@ -71,12 +71,12 @@ def sample_fabric(rng: np.random.Generator, patterns: tuple[str, ...] | None = N
 
 
 def _edge(x: np.ndarray, threshold: float, width: float) -> np.ndarray:
-    """A soft threshold.
+    """Soft threshold.
 
     Args:
         x: any shape.
-        threshold: where it is 0.5.
-        width: from there to where it is 0 or 1.
+        threshold: value of ``x`` at which the result is 0.5.
+        width: distance from the threshold at which it is 0 or 1.
 
     Returns:
         1 where ``x`` is above the threshold, 0 below.
@@ -90,7 +90,7 @@ def _wave(x: np.ndarray) -> np.ndarray:
 
 
 def paint(fabric: Fabric, across: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Colour points of cloth.
+    """Compute the colours of points on cloth.
 
     Args:
         fabric: pattern and colours.
@@ -134,11 +134,11 @@ def _pattern(
         v: [k] coordinate along the pattern, periods.
         along: [k] metres up the body.
         soft: width of edges, periods.
-        coarse: [k] smooth noise of zero mean and unit variance.
-        fabric: for its noise.
+        coarse: [k] smooth noise with zero mean and unit variance.
+        fabric: provides the noise.
 
     Returns:
-        Shares [k] of the second and of the third colour, 0 to 1.
+        Weights [k] of the second and of the third colour, 0 to 1.
     """
     none = np.zeros_like(u)
     if name == "stripes":
@@ -183,10 +183,10 @@ def print_emblem(
 
     Args:
         colour: [k, 3] in [0, 1] of the cloth.
-        x: [k] metres to the right, as seen by who looks at it.
+        x: [k] metres to the right, as seen by a viewer.
         y: [k] metres up.
-        centre: (x, y) of the emblem's middle, metres.
-        rng: draws kind, colour and size.
+        centre: (x, y) of the emblem's centre, metres.
+        rng: samples kind, colour and size.
 
     Returns:
         Colours [k, 3].
@@ -217,14 +217,14 @@ def print_emblem(
 
 
 def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.random.Generator) -> np.ndarray:
-    """Letter-like signs in a row: strokes between the nodes of a small grid.
+    """Mask of letter-like signs in a row: strokes between the nodes of a small grid.
 
     Args:
         u: [k] coordinate to the right, in half sizes of the emblem.
         v: [k] coordinate upwards, in half sizes of the emblem.
         count: number of signs.
         soft: half width of the strokes' edges, in half sizes of the emblem.
-        rng: draws the strokes.
+        rng: samples the strokes.
 
     Returns:
         Mask [k], 0 to 1.

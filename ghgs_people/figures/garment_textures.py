@@ -12,11 +12,11 @@ from ghgs_people.figures.place import Place
 
 
 def _line(distance: np.ndarray, width: float) -> np.ndarray:
-    """A line.
+    """Mask of a line.
 
     Args:
-        distance: [k] from its middle, metres.
-        width: beyond which it is 0, metres.
+        distance: [k], distance from the centre line, metres.
+        width: distance beyond which the mask is 0, metres.
 
     Returns:
         Mask [k], 1 on the line.
@@ -30,8 +30,8 @@ def _folds(across: np.ndarray, along: np.ndarray, noise: Noise, strength: np.nda
     Args:
         across: [k] metres around the body.
         along: [k] metres up it.
-        noise: of which folds are made.
-        strength: [k] of the shading, relative.
+        noise: noise of the folds.
+        strength: [k], relative strength of the shading.
 
     Returns:
         Factor [k] on the colours.
@@ -45,8 +45,8 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
 
     Args:
         top: the garment.
-        noise: of its folds.
-        rng: draws the emblem and the colour of the trim.
+        noise: noise of its folds.
+        rng: samples the emblem and the colour of the trim.
 
     Returns:
         Texture [h, w, 3] uint8 of the chart ``upper``.
@@ -88,7 +88,7 @@ def _trim(colour: np.ndarray, edge: np.ndarray, top: Top, rng: np.random.Generat
         colour: [k, 3] in [0, 1].
         edge: [k] distance to the nearest edge, metres.
         top: the garment.
-        rng: draws whether the trim has a colour of its own.
+        rng: samples whether the trim has its own colour.
 
     Returns:
         Colours [k, 3].
@@ -110,7 +110,7 @@ def _front_closure(colour: np.ndarray, place: Place, top: Top, on_arm: np.ndarra
 
     Args:
         colour: [k, 3] in [0, 1].
-        place: of the k texels.
+        place: places of the k texels.
         top: the garment.
         on_arm: [k] bool, texels of sleeves.
 
@@ -135,10 +135,10 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
 
     Args:
         bottom: the garment.
-        noise: of its folds.
+        noise: noise of its folds.
 
     Returns:
-        Texture [h, w, 3] uint8 of the chart ``lower``, or ``skirt`` for one.
+        Texture [h, w, 3] uint8 of the chart ``lower``, or ``skirt`` for a skirt.
     """
     if bottom.kind == "skirt":
         return _skirt_texture(bottom, noise)
@@ -170,7 +170,7 @@ def _belt(colour: np.ndarray, band: np.ndarray, bottom: Bottom, place: Place) ->
         colour: [k, 3] in [0, 1].
         band: [k] mask of the belt, 0 to 1.
         bottom: the garment.
-        place: of the k texels.
+        place: places of the k texels.
 
     Returns:
         Colours [k, 3].
@@ -186,10 +186,10 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
     """Paint twill, faded at thigh and knee.
 
     Args:
-        fabric: for its first colour and its noise.
+        fabric: provides the first colour and the noise.
         across: [k] metres around the leg.
-        place: of the k texels.
-        noise: of the faded parts.
+        place: places of the k texels.
+        noise: noise of the faded parts.
 
     Returns:
         Colours [k, 3].
@@ -209,11 +209,11 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
 
 
 def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
-    """Paint the seams of pockets, fly and crotch, in a thread of their own on jeans.
+    """Paint the seams of pockets, fly and crotch, with visible thread on jeans.
 
     Args:
         colour: [k, 3] in [0, 1].
-        place: of the k texels.
+        place: places of the k texels.
         bottom: the garment.
 
     Returns:
@@ -222,7 +222,7 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
     thread = np.array([0.72, 0.50, 0.25]) if bottom.kind == "jeans" else None
 
     def stitch(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Darken colours [k, 3] where a mask [k] is 1, and show the thread there."""
+        """Darken colours [k, 3] where a mask [k] is 1, and paint the thread there."""
         colour = darken(colour, mask, 0.35)
         return colour if thread is None else mix(colour, 0.5 * mask, thread)
 
@@ -241,7 +241,7 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
 
 
 def _skirt_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
-    """Paint a skirt; arguments and result as of :func:`bottom_texture`."""
+    """Paint a skirt; arguments and result as for :func:`bottom_texture`."""
     piece = chart("skirt")
     place = piece.texel_place
     across = place.trunk_angle * 0.17

@@ -1,5 +1,4 @@
-"""Shapes of garments: where they end (fields on the average body) and how they drape over a
-posed body."""
+"""Shapes of garments: their edges (fields on the average body) and their draping over a posed body."""
 
 from dataclasses import dataclass
 
@@ -30,18 +29,18 @@ class Figure:
     posed: np.ndarray  # [BODY_VERTICES, 3] vertices of the skin in the pose
 
 
-# ---- where garments end: signed distance to the edge in metres, positive where there is cloth
+# ---- edges of garments: signed distance to the edge in metres, positive on cloth
 
 
 def neckline(place: Place, kind: str) -> np.ndarray:
     """Field of a neckline.
 
     Args:
-        place: of n points.
+        place: places of n points.
         kind: crew, scoop, vee, collar or straps.
 
     Returns:
-        [n] metres below it, negative above.
+        [n] metres below the neckline, negative above.
     """
     back, slope, radius, rise = {
         "crew": (1.422, 0.50, 0.072, 0.03),
@@ -63,7 +62,7 @@ def top_field(place: Place, top: Top) -> np.ndarray:
     """Field of a top or a jacket.
 
     Args:
-        place: of n points.
+        place: places of n points.
         top: the garment.
 
     Returns:
@@ -85,7 +84,7 @@ def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
     """Field of trousers or a skirt.
 
     Args:
-        place: of n points.
+        place: places of n points.
         bottom: the garment.
 
     Returns:
@@ -96,10 +95,10 @@ def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
 
 
 def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
-    """Field of shoes: they are low in front of the ankle, higher at the heel.
+    """Field of shoes, which are low in front of the ankle and higher at the heel.
 
     Args:
-        place: of n points.
+        place: places of n points.
         shoes: the shoes.
 
     Returns:
@@ -109,18 +108,18 @@ def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
     return shoes.top - place.y + 0.02 * instep + 0.008 * np.cos(place.leg_angle)
 
 
-# ---- how they drape
+# ---- draping
 
 
 def push_out(
     points: np.ndarray, vertices: np.ndarray, normals: np.ndarray, clearance: np.ndarray
 ) -> np.ndarray:
-    """Move points outwards until they keep a distance from a body.
+    """Move points outwards to a minimum distance from a body.
 
     Args:
         points: [g, 3], metres.
-        vertices: [n, 3] of the body, metres.
-        normals: [n, 3] of the body, unit vectors.
+        vertices: [n, 3], vertices of the body, metres.
+        normals: [n, 3], unit normals of the body.
         clearance: [g], least distance along the normal of the nearest vertex, metres.
 
     Returns:
@@ -136,9 +135,9 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     """Drape a top or a jacket.
 
     Args:
-        figure: who wears it.
+        figure: the wearer.
         top: the garment.
-        noise: of its folds.
+        noise: noise of its folds.
 
     Returns:
         Points [g, 3] of the upper chart in the pose, metres.
@@ -200,8 +199,8 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
 
     Args:
         points: [g, 3] at rest, metres.
-        place: of the points.
-        share: how much of the cloth hangs, 0 to 1; one number or [g].
+        place: places of the points.
+        share: fraction of the cloth that hangs, 0 to 1; one number or [g].
 
     Returns:
         [g, 3].
@@ -222,7 +221,7 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
     grid = np.zeros(rows * columns)
     np.maximum.at(grid, cell[chosen], radius[chosen])
     grid = grid.reshape(rows, columns)
-    fall = (top - bottom) / rows * 0.10  # it narrows by 10 cm per metre
+    fall = (top - bottom) / rows * 0.10  # narrows by 10 cm per metre
     for below in range(1, rows):
         grid[below] = np.maximum(grid[below], grid[below - 1] - fall)
     grid = gaussian_filter1d(gaussian_filter1d(grid, 1.2, axis=1, mode="wrap"), 1.0, axis=0, mode="nearest")
@@ -239,9 +238,9 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     """Drape trousers, leggings or shorts.
 
     Args:
-        figure: who wears them.
+        figure: the wearer.
         bottom: the garment.
-        noise: of its folds.
+        noise: noise of its folds.
 
     Returns:
         Points [g, 3] of the lower chart in the pose, metres.
@@ -273,9 +272,9 @@ def _widen_legs(
     """Widen each leg to the radius of its cut: a straight tube from the thigh to the hem.
 
     Args:
-        figure: who wears the trousers.
+        figure: the wearer.
         points: [g, 3] of the lower chart at rest, metres.
-        place: of the points.
+        place: places of the points.
         bottom: the garment.
         folds: [g] height of folds, metres.
 
@@ -304,10 +303,10 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
     """Drape a skirt, flared towards the hem, with folds.
 
     Args:
-        figure: who wears it.
+        figure: the wearer.
         bottom: the garment.
-        noise: of the folds' course.
-        rng: draws number and depth of the folds.
+        noise: noise of the folds' course.
+        rng: samples number and depth of the folds.
 
     Returns:
         Points [g, 3] of the skirt chart in the pose, metres.
@@ -330,10 +329,10 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
 
 
 def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
-    """Shape shoes: rounded toes, a flat sole below the foot.
+    """Shape shoes with rounded toes and a flat sole below the foot.
 
     Args:
-        figure: who wears them.
+        figure: the wearer.
         shoes: the shoes.
 
     Returns:
@@ -355,10 +354,10 @@ def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
 
 
 def _pose(figure: Figure, piece: Chart, points: np.ndarray, clearance: np.ndarray) -> np.ndarray:
-    """Pose a garment by its skinning weights; move it out of the body before and after.
+    """Pose a garment by its skinning weights, moving it out of the body before and after.
 
     Args:
-        figure: who wears it.
+        figure: the wearer.
         piece: its chart.
         points: [g, 3] at rest, metres.
         clearance: [g], least distance from the body, metres; negative where it may be inside.

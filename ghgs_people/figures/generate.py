@@ -1,4 +1,4 @@
-"""Generate a person from two numbers: shape, pose, clothes, colours."""
+"""Generate a person (shape, pose, clothes, colours) from a seed and an index."""
 
 from copy import deepcopy
 from functools import lru_cache
@@ -31,13 +31,13 @@ from ghgs_people.figures.pose import sample_pose
 
 OVERLAP = 0.03  # how far skin and inner layers go on below an outer garment, metres
 MAX_YAW = 30.0  # degrees to either side
-MAX_POSES = 6  # drawn until the arms are clear of the trunk, each with the arms further apart
+MAX_POSES = 6  # attempts until the arms are clear of the trunk, each with the arms further apart
 
 
 class Character:
-    """A person apart from the pose: shape, clothes, colours and hair.
+    """A person independent of the pose: shape, clothes, colours and hair.
 
-    ``first`` is the pose that it stands in; ``motion_rng`` draws others.
+    ``first`` is the initial pose; ``motion_rng`` samples others.
 
     Args:
         seed: of a family of people, at least 0.
@@ -63,11 +63,11 @@ class Character:
         self.cut = under_hat(cut) if self.outfit.beanie else cut
 
     def dressed(self, figure: Figure, spheres: Spheres) -> list[TexturedMesh]:
-        """Skin, clothes, hair and cap over a figure of this shape, the same ones each time.
+        """Create skin, clothes, hair and cap over a figure of this shape, the same in each call.
 
         Args:
             figure: this person in any pose.
-            spheres: of its body in that pose, which cast shadows.
+            spheres: spheres of its body in that pose, which cast shadows.
         """
         scalp = 0.25 if self.cut.style == "bald" else 1.0
         parts = [skin_part(figure, self.outfit, self.look, spheres, scalp)]
@@ -77,7 +77,7 @@ class Character:
         return [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
 
     def placed(self, parts: list[TexturedMesh], bodies: np.ndarray, first: int) -> Person:
-        """Place meshes in front of the cameras, as the first pose stands.
+        """Place meshes in front of the cameras, aligned by the first pose.
 
         Args:
             parts: meshes in one frame; the ``first`` ones are in the first pose and stand on y = 0.
@@ -96,7 +96,7 @@ class Character:
 
 
 def generate(seed: int, index: int, active: bool = False) -> Person:
-    """Generate a person, the same on every machine, up to rounding.
+    """Generate a person, reproducible on every machine up to rounding.
 
     An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding
     box of the body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin;
@@ -118,12 +118,12 @@ def generate(seed: int, index: int, active: bool = False) -> Person:
 def pose_figure(
     body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator, active: bool = False
 ) -> Figure:
-    """Draw a pose in which the arms do not run into the trunk.
+    """Sample a pose in which the arms do not intersect the trunk.
 
     Args:
         body: the base mesh.
         coefficients: [k] of the person's shape.
-        rng: draws the pose.
+        rng: samples the pose.
         active: as in sport or dance.
 
     Returns:
@@ -140,14 +140,14 @@ def pose_figure(
 
 
 def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
-    """How deep forearms and hands are inside trunk and thighs.
+    """Penetration depth of forearms and hands into trunk and thighs.
 
     Args:
         posed: vertices [BODY_VERTICES, 3] of the skin in the pose, metres.
         faces: [m, 3] of the skin.
 
     Returns:
-        Metres, 0 where they are outside.
+        Metres, 0 without penetration.
     """
     limb, solid = _limbs_and_trunk()
     normals = vertex_normals(posed, faces)
@@ -161,7 +161,7 @@ def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
 
 @lru_cache(maxsize=1)
 def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
-    """Indices of some vertices of forearms and hands, and of what they must not run into."""
+    """Indices of some vertices of forearms and hands, and of parts that they must not intersect."""
     body = load_body()
     bones = body.weights[:BODY_VERTICES].argmax(1)
     limbs = [name.startswith(("lowerarm", "wrist", "finger")) for name in body.bone_names]
@@ -170,13 +170,13 @@ def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
 
 
 def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Make top and jacket, trousers or skirt, shoes; each without what the next one hides.
+    """Create top and jacket, trousers or skirt, and shoes, each without parts hidden by the next one.
 
     Args:
-        figure: who wears them.
+        figure: the wearer.
         outfit: what is worn.
         spheres: of the body in the pose, which cast shadows.
-        rng: draws folds, emblems and trims.
+        rng: samples folds, emblems and trims.
     """
     noise = Noise(rng, 2.3, 3.0, 128)
     top = outfit.top
@@ -232,9 +232,9 @@ def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Gener
 def skin_part(
     figure: Figure, outfit: Outfit, look: Complexion, spheres: Spheres, scalp: float
 ) -> TexturedMesh:
-    """Make head, eyes and the skin that clothes leave bare.
+    """Create head, eyes and the skin that is not covered by clothes.
 
-    They are one mesh, so that normals agree at the neck.
+    They form one mesh, so that normals are continuous at the neck.
 
     Args:
         figure: the person.
@@ -265,11 +265,7 @@ def skin_part(
 
 
 def join(parts: list[TexturedMesh]) -> TexturedMesh:
-    """One mesh of several opaque ones, their textures side by side.
-
-    Args:
-        parts: at least one.
-    """
+    """Merge at least one opaque mesh into one, with the textures side by side."""
     height = max(part.texture.shape[0] for part in parts)
     width = sum(part.texture.shape[1] for part in parts)
     textures = []
@@ -293,11 +289,11 @@ def bare_field(place: Place, outfit: Outfit) -> np.ndarray:
     """Field of bare skin.
 
     Args:
-        place: of n points.
+        place: places of n points.
         outfit: what covers the skin.
 
     Returns:
-        [n] metres, positive where skin shows, and `OVERLAP` further below the clothes.
+        [n] metres, positive on visible skin, and `OVERLAP` further below the clothes.
     """
     covered = np.maximum(garments.top_field(place, outfit.top), garments.shoe_field(place, outfit.shoes))
     bottom = garments.bottom_field(place, outfit.bottom)

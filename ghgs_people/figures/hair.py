@@ -1,5 +1,4 @@
-"""Hair (a shell over the scalp, a curtain that falls from it, a ponytail, a bun) and
-knitted caps."""
+"""Hair (a shell over the scalp, a curtain that falls from it, a ponytail, a bun) and knitted caps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,11 +36,11 @@ class Haircut:
 
 
 def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:
-    """Draw a haircut.
+    """Sample a haircut.
 
     Args:
-        rng: draws everything.
-        female: which of `SHARES` is used.
+        rng: samples everything.
+        female: selects the entry of `SHARES`.
     """
     style = str(rng.choice(STYLES, p=SHARES[female]))
     thickness = {
@@ -53,16 +52,16 @@ def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:
 
 
 def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Make the hair in the pose.
+    """Create the hair in the pose.
 
     Args:
         figure: the person.
         cut: its haircut.
         look: its colours.
-        rng: draws place and size of a ponytail or bun.
+        rng: samples place and size of a ponytail or bun.
 
     Returns:
-        Meshes; none for a bald head.
+        Meshes; empty for a bald head.
     """
     if cut.style == "bald":
         return []
@@ -75,7 +74,7 @@ def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Gen
 
 
 def _strands(look: Complexion, across: np.ndarray, along: np.ndarray, curl: float) -> np.ndarray:
-    """Colour hair: streaks along the strands.
+    """Colour hair with streaks along the strands.
 
     Args:
         look: colours of the person.
@@ -95,7 +94,7 @@ def _strands(look: Complexion, across: np.ndarray, along: np.ndarray, curl: floa
 
 
 def _shell(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
-    """The scalp, displaced outwards; it thins out towards the hairline."""
+    """Displace the scalp outwards, thinning towards the hairline."""
     piece = chart("scalp")
     point = piece.place.point
     above = hairline(point)
@@ -143,7 +142,7 @@ def _grid_faces(rows: int, columns: int) -> np.ndarray:
 def _grid_mesh(
     figure: Figure, points: np.ndarray, weights: np.ndarray, clearance: float, texture: np.ndarray
 ) -> TexturedMesh:
-    """Skin a grid and keep it outside the body.
+    """Skin a grid, keeping it outside of the body.
 
     Args:
         figure: the person.
@@ -164,7 +163,7 @@ def _grid_mesh(
 
 
 def _hanging_weights(heights: np.ndarray, neck: float) -> np.ndarray:
-    """Skinning weights of hair: above the neck the head's, below the chest's.
+    """Skinning weights of hair: the head's above the neck, the chest's below.
 
     Args:
         heights: [n] at rest, metres.
@@ -186,8 +185,8 @@ def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
 
     Args:
         look: colours of the person.
-        wave: how wavy they are, 0 to 1.
-        length: of the strands, metres.
+        wave: waviness, 0 to 1.
+        length: length of the strands, metres.
     """
     v, u = np.meshgrid((np.arange(512) + 0.5) / 512, (np.arange(512) + 0.5) / 512, indexing="ij")
     swing = 0.012 * wave * np.sin(2 * np.pi * (3.0 * v + 0.25 * look.noise(2 * u, 0.5 * v)))
@@ -197,7 +196,7 @@ def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
 
 
 def _curtain(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
-    """Hair that grows from the crown in all directions and falls behind and beside the neck."""
+    """Create hair that grows from the crown in all directions and falls behind and beside the neck."""
     centre, scale, radius_at = _skull(figure)
     columns = np.linspace(-1, 1, COLUMNS)
     half = ROWS // 2
@@ -226,8 +225,8 @@ def _curtain(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
 
 
 def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np.ndarray]]:
-    """Centre [3] of the cranium, its size against the average one,
-    its radius along directions [..., 3]."""
+    """Centre [3] of the cranium, its size relative to the average, and a function of its radius along
+    directions [..., 3]."""
     piece = chart("head")
     upper = piece.place.y > 1.50
     head = (piece.interpolation @ figure.rest)[upper]
@@ -238,7 +237,7 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
     tree = cKDTree((head - centre) / radii[:, None])
 
     def radius_at(direction: np.ndarray) -> np.ndarray:
-        """Radius [...] along unit vectors [..., 3]: a mean of the 12 nearest vertices."""
+        """Radius [...] along unit vectors [..., 3], a mean of the 12 nearest vertices."""
         distance, index = tree.query(direction.reshape(-1, 3), k=12)
         weight = 1 / (distance + 0.06) ** 2
         return ((radii[index] * weight).sum(1) / weight.sum(1)).reshape(direction.shape[:-1])
@@ -247,16 +246,16 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
 
 
 def _face(height: np.ndarray) -> np.ndarray:
-    """Half of the angle in degrees around the face without hair, at heights of the average head."""
+    """Half angle in degrees of the face without hair, at heights of the average head."""
     return np.interp(height, [1.44, 1.552, 1.572, 1.600, 1.622, 1.634, 1.64], [98, 84, 74, 60, 42, 12, 0.5])
 
 
 def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
-    """Make a knitted cap down to the ears, its brim turned up.
+    """Create a knitted cap down to the ears, with the brim turned up.
 
     Args:
-        figure: who wears it.
-        fabric: of the cap.
+        figure: the wearer.
+        fabric: fabric of the cap.
     """
     piece = chart("scalp")
     points = piece.interpolation @ figure.rest
@@ -274,23 +273,19 @@ def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
 
 
 def under_hat(cut: Haircut) -> Haircut:
-    """The haircut below a hat: flat on the scalp.
-
-    Args:
-        cut: without the hat.
-    """
+    """Flatten a haircut for wear below a hat."""
     style = cut.style if cut.style in ("bald", "bob", "long") else "crop"
     return Haircut(style, min(cut.thickness, 0.007), cut.end, cut.wave)
 
 
 def _tail(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:
-    """Make a ponytail or a bun at the back of the head.
+    """Create a ponytail or a bun at the back of the head.
 
     Args:
         figure: the person.
-        cut: of style ``tail`` or ``bun``.
+        cut: haircut of style ``tail`` or ``bun``.
         look: colours of the person.
-        rng: draws place and size.
+        rng: samples position and size.
     """
     body = load_body()
     skull = body.mean[:BODY_VERTICES]

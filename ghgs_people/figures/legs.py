@@ -1,29 +1,29 @@
-"""Legs are posed by inverse kinematics: the soles are placed on the ground and the knees follow, so
-feet do not float."""
+"""Pose legs by inverse kinematics: soles are placed on the ground and knees follow, so feet do not
+float."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ghgs_people.figures.skeleton import Skeleton, frame
 
-#: Of people in motion, with the least and greatest share of its length to which a leg is bent.
+#: Stances in motion, with the least and greatest fraction of its length to which a leg is bent
 BENT = {"lunge": (0.62, 0.95), "squat": (0.45, 0.85), "cross": (0.98, 1.0), "crouch": (0.55, 0.8)}
 
 
 def pose_legs(
     skeleton: Skeleton, pelvis: np.ndarray, stance: str, stride: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Place the soles on the ground, solve hips and knees.
+    """Place the soles on the ground, and solve for hips and knees.
 
     Args:
-        skeleton: whose rotations are set.
-        pelvis: its rotation [3, 3].
+        skeleton: skeleton whose rotations are set.
+        pelvis: rotation [3, 3] of the pelvis.
         stance: one of `STANCES` or `BENT`.
         stride: how far the left foot is in front (behind where negative), in lengths of the leg.
-        rng: draws the feet and how far the legs are bent.
+        rng: samples the feet and the bend of the legs.
 
     Returns:
-        Where the root joint goes [3], metres.
+        Position of the root joint [3], metres.
     """
     (root,) = skeleton.rest("root")
     feet = _feet(skeleton, stance, stride, rng)
@@ -64,14 +64,14 @@ def _feet(
     """Place the feet.
 
     Args:
-        skeleton: for the width of the hips and the length of the legs.
+        skeleton: provides the width of the hips and the length of the legs.
         stance: one of `STANCES` or `BENT`.
         stride: how far the left foot is in front (behind where negative), in lengths of the leg.
-        rng: draws the deviations.
+        rng: samples the deviations.
 
     Returns:
-        For the left and the right foot: ankle across and forward (metres),
-        yaw and heel lift (degrees).
+        For the left and the right foot: ankle position across and forward (metres), yaw and heel lift
+        (degrees).
     """
     half, leg, _ = skeleton.rest("upperleg01.L")[0]
     half = half * rng.uniform(0.85, 1.25)
@@ -119,11 +119,11 @@ def _solve_leg(
     """Two-bone inverse kinematics by the law of cosines.
 
     Args:
-        skeleton: whose rotations are set.
+        skeleton: skeleton whose rotations are set.
         end: ``.L`` or ``.R``.
-        hip: its joint [3] in the pose, metres.
-        ankle: its joint [3] in the pose, metres.
-        lengths: of thigh and shin, metres.
+        hip: hip joint [3] in the pose, metres.
+        ankle: ankle joint [3] in the pose, metres.
+        lengths: lengths of thigh and shin, metres.
         toward: direction [3] that the knee points to.
     """
     thigh, shin = lengths

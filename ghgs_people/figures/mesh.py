@@ -1,4 +1,4 @@
-"""Textured meshes and people made of them: what is photographed.
+"""Textured meshes, and people that consist of them.
 
 Metres, y up, feet on y = 0, facing +z up to a yaw about y.
 Built-in people and scans use the same two types.
@@ -18,8 +18,8 @@ class TexturedMesh:
     """One part of a person: triangles with one texture.
 
     Raises:
-        InputError: an array has another shape or a value that is not finite, or the faces name
-            vertices that do not exist.
+        InputError: an array has another shape or a non-finite value, or faces refer to missing
+            vertices.
     """
 
     vertices: np.ndarray  # [n, 3] float32, metres
@@ -46,8 +46,8 @@ class Person:
     """A dressed, posed person.
 
     Args:
-        name: of the person, for files and messages.
-        parts: its meshes, in one frame.
+        name: name of the person, for files and messages.
+        parts: meshes in a common frame.
         body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts;
             None: unknown.
     """
@@ -57,7 +57,7 @@ class Person:
     body_vertices: np.ndarray | None
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Person":
-        """Move the person.
+        """Transform the vertices of the person.
 
         Args:
             function: maps vertices [n, 3] float64; applied to parts and body.

@@ -1,5 +1,4 @@
-"""Operations on triangle and quad meshes: normals, subdivision, smoothing, clipping,
-rasterising UV."""
+"""Operations on triangle and quad meshes: normals, subdivision, smoothing, clipping, UV rasterization."""
 
 import numpy as np
 import trimesh
@@ -20,7 +19,7 @@ def triangles(quads: np.ndarray) -> np.ndarray:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals, the mean of the faces around each vertex weighted by area.
+    """Unit vertex normals: area-weighted mean of the normals of adjacent faces.
 
     Args:
         vertices: [n, 3].
@@ -29,15 +28,15 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Returns:
         [n, 3]; 0 where normals cancel.
     """
-    double_areas = trimesh.triangles.cross(vertices[faces])  # their length is what weights them
+    double_areas = trimesh.triangles.cross(vertices[faces])  # their length is the weight
     return trimesh.geometry.mean_vertex_normals(len(vertices), faces, double_areas)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals of which vertices that a UV seam splits at one position share one.
+    """Unit vertex normals that are shared by vertices at the same position, such as along UV seams.
 
     Args:
-        vertices: [n, 3]; positions are one where six decimals agree.
+        vertices: [n, 3]; positions are equal if six decimals agree.
         faces: [m, 3], counter-clockwise seen from outside.
 
     Returns:
@@ -48,7 +47,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Split each quad in four, by the middles of edges and faces.
+    """Split each quad into four, at the midpoints of edges and faces.
 
     Args:
         quads: [m, 4] indices of vertices.
@@ -74,8 +73,8 @@ def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndar
 
 
 def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    """One step of Laplacian smoothing: half the way to the mean of the neighbours;
-    the border stays.
+    """Operator of one step of Laplacian smoothing: half the way to the mean of the neighbours, with a fixed
+    border.
 
     Args:
         faces: [m, c] indices of vertices, triangles or quads.
@@ -106,7 +105,7 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
         field: [n] on the vertices, linear between them.
 
     Returns:
-        Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the share `t`
+        Faces [k, 3] of new vertices, and for each new vertex two old ones `a`, `b` and the weight `t`
         of `b`: an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
     """
     count = len(field)
@@ -139,7 +138,7 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tuple[np.ndarray, ...]:
-    """Find the face that each texel of a texture shows.
+    """Find the face of each texel of a texture.
 
     Args:
         uv: [n, 2] in [0, 1], origin at the bottom left.

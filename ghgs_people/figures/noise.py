@@ -7,8 +7,8 @@ class Noise:
     """A periodic field with zero mean, unit variance and a power spectrum of 1 / f^(2 slope).
 
     Args:
-        rng: draws the field.
-        slope: the larger, the smoother.
+        rng: samples the field.
+        slope: larger values are smoother.
         fineness: lowest number of waves per period.
         size: values per period, along both axes.
     """
@@ -22,7 +22,7 @@ class Noise:
         self.field = (field / field.std()).astype(np.float32)
 
     def __call__(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear values; by hand in float32, faster than SciPy.
+        """Sample bilinearly, in float32 and faster than SciPy.
 
         Args:
             u: column in periods, any shape; the field repeats.

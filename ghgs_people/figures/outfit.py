@@ -1,4 +1,4 @@
-"""What a person wears, as numbers: `garments` makes shapes of it, `garment_textures` colours.
+"""Parameters of a person's clothes, from which `garments` makes shapes and `garment_textures` colours.
 
 Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0,
 neck 1.43); sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
@@ -65,7 +65,7 @@ class Shoes:
 
 @dataclass(frozen=True)
 class Outfit:
-    """Everything worn, from the skin outwards."""
+    """All clothes, from the skin outwards."""
 
     top: Top
     jacket: Top | None
@@ -75,11 +75,11 @@ class Outfit:
 
 
 def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
-    """Draw an outfit.
+    """Sample an outfit.
 
     Args:
-        rng: draws everything.
-        female: whether skirts and cropped tops are possible.
+        rng: samples everything.
+        female: allows skirts and cropped tops.
     """
     skirt = female and rng.random() < 0.36
     dress = skirt and rng.random() < 0.4
@@ -99,11 +99,11 @@ def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
 
 
 def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
-    """Draw a top.
+    """Sample a top.
 
     Args:
-        rng: draws everything.
-        female: whether it may be cropped.
+        rng: samples everything.
+        female: allows a cropped top.
         tucked: into trousers or skirt.
     """
     kind = str(rng.choice(("tee", "sweater", "shirt", "tank"), p=(0.40, 0.27, 0.22, 0.11)))

@@ -27,14 +27,7 @@ _LIMBS = {
 
 
 def _part_of(bone: str) -> str:
-    """Name the part of the body that a bone belongs to.
-
-    Args:
-        bone: its name.
-
-    Returns:
-        One of ``PARTS``.
-    """
+    """Body part, one of ``PARTS``, of a bone by its name."""
     for name, beginnings in _TRUNK.items():
         if bone.startswith(beginnings):
             return name
@@ -44,7 +37,7 @@ def _part_of(bone: str) -> str:
 
 @cache
 def vertex_parts() -> np.ndarray:
-    """The part of each vertex of the skin [n]: that with the largest total weight of its bones."""
+    """Part [n] of each vertex of the skin: the one whose bones have the largest total weight."""
     body = load_body()
     weights = np.zeros((BODY_VERTICES, len(PARTS)))
     for bone, name in enumerate(body.bone_names):
@@ -53,7 +46,7 @@ def vertex_parts() -> np.ndarray:
 
 
 class BuiltInParts(BodyParts):
-    """Parts of the vertices of built-in people."""
+    """Body parts of the vertices of built-in people."""
 
     vertices: ClassVar[int] = BODY_VERTICES
 

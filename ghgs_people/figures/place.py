@@ -1,8 +1,6 @@
-"""Places on the body: coordinates on the average body at rest,
-in which clothes and faces are described.
+"""Places on the body: coordinates on the average body at rest, in which clothes and faces are described.
 
-Patterns, seams, hems and necklines are functions of the place,
-so they are the same for every shape.
+Patterns, seams, hems and necklines are functions of the place, so they are the same for every shape.
 """
 
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ class Place:
 
 
 def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
-    """Find the places of points of the average body.
+    """Compute the places of points on the average body.
 
     Args:
         point: [n, 3], metres, on the average body at rest.
@@ -61,7 +59,7 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
     arm_angle = np.arctan2(radial @ [0.74, 0.67, 0.0], radial @ [0.0, 0.0, 1.0])
     legs = np.array([joints[body.bone(n + ".L")] for n in ("upperleg01", "lowerleg01", "foot")])
     centre = np.stack([np.interp(-folded[:, 1], -legs[:, 1], legs[:, i]) for i in (0, 2)], 1)
-    # Above the legs the angle is taken around the middle of each half of the trunk.
+    # Above the legs, the angle is around the centre of each half of the trunk.
     centre[:, 0] += smoothstep(CROTCH - 0.1, 0.95, folded[:, 1]) * (0.09 - centre[:, 0])
     leg_angle = np.arctan2(folded[:, 0] - centre[:, 0], folded[:, 2] - centre[:, 1])
     trunk_angle = np.arctan2(point[:, 0] / 1.45, point[:, 2] - 0.09)
@@ -70,11 +68,11 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
 
 
 def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates along a polyline, whose ends are extended straight.
+    """Coordinates along a polyline whose ends are extended straight.
 
     Args:
         points: [n, 3], metres.
-        line: its joints, each [3], metres.
+        line: vertices of the polyline, each [3], metres.
 
     Returns:
         Length [n] along the line from its first joint, and offset [n, 3] from it.

@@ -1,7 +1,7 @@
 """Poses on two feet within the limits of human joints: gestures for the arms, stances for the legs.
 
-Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and where the
-forearm points; legs by inverse kinematics (:mod:`ghgs_people.figures.legs`). Directions are in the
+Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and a direction of the
+forearm; legs by inverse kinematics (:mod:`ghgs_people.figures.legs`). Directions are in the
 person's frame: +x left, +y up, +z forward; for the right side x is mirrored.
 """
 
@@ -43,15 +43,14 @@ STANCES = ("stand", "contrapposto", "walk", "step", "crouch", "wide")
 def sample_pose(
     body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
 ) -> np.ndarray:
-    """Draw a pose.
+    """Sample a pose.
 
     Args:
         body: the base mesh.
-        joints: [b, 3] at rest, of one shape, metres.
-        rng: draws everything.
+        joints: [b, 3], joints of one shape at rest, metres.
+        rng: samples everything.
         widen: how far the arms move away from the body, 0 to 1.
-        active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or
-            walking.
+        active: sport or dance, with legs far apart, bent or crossed, instead of standing or walking.
 
     Returns:
         Transforms [b, 3, 4] of the bones from rest to the pose, the soles on y = 0.
@@ -72,7 +71,7 @@ def sample_pose(
 
 
 def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
-    """Choose what the left and the right arm do: half the time the same thing."""
+    """Choose gestures of the left and the right arm, the same for both half of the time."""
     if stance == "walk" and rng.random() < 0.7:
         return "loose", "loose"
     first = str(rng.choice(EVERYDAY if rng.random() < 0.7 else STRIKING))
@@ -87,7 +86,7 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
         body: the base mesh.
         local: [b, 3, 3] rotations relative to the parents, changed in place.
         stance: one of `STANCES` or `BENT`.
-        rng: draws the angles.
+        rng: samples the angles.
 
     Returns:
         Rotation [3, 3] of the pelvis.
@@ -118,7 +117,7 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
 
 
 def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """Rotations in world axes.
+    """Convert relative rotations of bones to world axes.
 
     Args:
         parents: [b] int, -1 for the root; parents come before children.
@@ -135,7 +134,7 @@ def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
 
 
 def _descendants(body: BodyModel, bone: str) -> list[int]:
-    """A bone and all bones below it in the rig."""
+    """A bone and all its descendants."""
     members = [body.bone(bone)]
     for child, parent in enumerate(body.bone_parents):
         if parent in members:
@@ -149,13 +148,12 @@ def _pose_arm(
     """Rotate one arm, with its hand and the shoulder girdle.
 
     Args:
-        skeleton: whose rotations are set.
+        skeleton: skeleton whose rotations are set.
         side: +1: left, -1: right.
         gesture: one of `GESTURES`.
         widen: how far the arm moves away from the body, 0 to 1.
-        swing: how far the upper arm points forward (back where negative) when walking,
-            about -0.5 to 0.5.
-        rng: draws the angles.
+        swing: swing of the upper arm when walking, positive forward, about -0.5 to 0.5.
+        rng: samples the angles.
     """
     end = ".L" if side > 0 else ".R"
     mirror = np.array([side, 1.0, 1.0])
@@ -196,11 +194,11 @@ def _pose_hand(skeleton: Skeleton, end: str, hand: np.ndarray, curl: float, rng:
     """Bend the wrist a little and curl the fingers.
 
     Args:
-        skeleton: whose rotations are set.
+        skeleton: skeleton whose rotations are set.
         end: ``.L`` or ``.R``.
         hand: rotation [3, 3] of the straight hand in world axes.
-        curl: of the fingers, radians.
-        rng: draws small deviations.
+        curl: curl of the fingers, radians.
+        rng: samples small deviations.
     """
     index, little = skeleton.rest("finger2-1", "finger5-1", end=end)
     across = (index - little) / np.linalg.norm(index - little)
@@ -216,7 +214,7 @@ def _pose_hand(skeleton: Skeleton, end: str, hand: np.ndarray, curl: float, rng:
         one, two = skeleton.rest(f"{finger}-1", f"{finger}-2", end=end)
         along[finger] = (two - one) / np.linalg.norm(two - one)
     middle = np.mean([along[finger] for finger in FINGERS], 0)
-    close = rng.uniform(0.2, 0.9)  # the hand at rest is spread
+    close = rng.uniform(0.2, 0.9)  # the hand is spread at rest
     for number, finger in enumerate(FINGERS):
         amount = curl * (0.75 + 0.14 * number) + rng.uniform(-0.06, 0.06)
         sideways = _shortest(along[finger], (1 - close) * along[finger] + close * middle)
@@ -229,12 +227,12 @@ def _pose_hand(skeleton: Skeleton, end: str, hand: np.ndarray, curl: float, rng:
 
 
 def _fraction(rotation: np.ndarray, share: float) -> np.ndarray:
-    """A share of a rotation [3, 3] about its own axis."""
+    """Scale the angle of a rotation [3, 3] by a factor."""
     return Rotation.from_rotvec(share * Rotation.from_matrix(rotation).as_rotvec()).as_matrix()
 
 
 def _shortest(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The smallest rotation [3, 3] that turns direction `start` into `end`."""
+    """Smallest rotation [3, 3] from direction `start` to `end`."""
     axis = np.cross(start, end)
     sine = np.linalg.norm(axis)
     angle = np.arctan2(sine, start @ end)

@@ -1,4 +1,4 @@
-"""What poses are made of: joints at rest, and rotations of bones."""
+"""Skeleton of a pose: joints at rest, and rotations of bones."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,7 @@ from ghgs_people.figures.body import BodyModel
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints at rest [b, 3] and the rotations [b, 3, 3] of the bones in world axes,
-    which posing fills in."""
+    """Joints at rest [b, 3] and rotations [b, 3, 3] of the bones in world axes, which posing sets."""
 
     body: BodyModel
     joints: np.ndarray
@@ -20,8 +19,8 @@ class Skeleton:
         """Look up joints at rest.
 
         Args:
-            bones: names of k bones; a bone begins at its joint.
-            end: added to every name, such as ``.L``.
+            bones: names of k bones; a bone starts at its joint.
+            end: suffix of every name, such as ``.L``.
 
         Returns:
             [k, 3], metres.
@@ -39,8 +38,7 @@ class Skeleton:
 
 
 def frame(along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Right-handed frame [3, 3] (columns) with its first axis `along`,
-    its third nearest to `across`."""
+    """Right-handed frame [3, 3] (columns) with first axis `along` and third axis nearest to `across`."""
     first = along / np.linalg.norm(along)
     third = across - (across @ first) * first
     third /= np.linalg.norm(third)
