@@ -21,10 +21,7 @@ from tests.helpers.pretend_device import DEVICE, pretend_device
 HERE = "cpu"
 
 
-@pytest.fixture(autouse=True)
-def no_gradient():
-    with torch.no_grad():
-        yield
+pytestmark = pytest.mark.usefixtures("no_gradient")
 
 
 def make_cache(**options):

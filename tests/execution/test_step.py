@@ -9,7 +9,6 @@ import torch
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
-from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.execution import Predictor, step
 from ghgs_lit.execution.graphs import GraphCache
@@ -22,20 +21,14 @@ from ghgs_lit.training.cost import Costs
 from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
-from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.pretend_device import DEVICE
 from tests.test_device import PretendAccelerator
 
 LOSSES = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.0, "depth": 0.2})
 PAPER = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0})
 
 
-@pytest.fixture(autouse=True)
-def there():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pretend_device() as log, drawing_nothing():
-        yield log
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("there")
 
 
 def training(*overrides):
@@ -135,22 +128,6 @@ def test_gradients_of_float16_do_not_underflow():
     total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
     (slope,) = step._differentiate(total, [weight], torch.tensor(2.0**10))
     assert torch.equal(slope, torch.full((4,), 2.0**-26))
-
-
-def test_weights_that_move_are_read_where_they_are():
-    """An optimizer updates weights in place; the next replay reads them."""
-    model, batch = training("model=paper"), scene()
-    captured = make_step(model)
-    optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
-    totals = []
-    for _ in range(4):
-        found = captured(batch)
-        totals.append(float(found.total.detach().cpu()))
-        wanted = float(call_eagerly(model, batch)[0].detach().cpu())
-        assert totals[-1] == pytest.approx(wanted, rel=1e-6)
-        gradients_of(model, found.total)
-        optimizer.step()
-    assert len(set(totals)) == 4
 
 
 def train(folder, capture):
