@@ -1,4 +1,4 @@
-"""Videos of a figure on disk."""
+"""Fixture with videos of a figure on disk."""
 
 import shutil
 
@@ -10,7 +10,7 @@ from tests.helpers.videos import write_video
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Four videos with masks, and the calibration."""
+    """Write four videos with masks, and the calibration."""
     place = tmp_path_factory.mktemp("videos")
     for camera, name in enumerate(FIGURE.names):
         write_video(place / "images" / f"{name}.mp4", frames_of(camera))

@@ -1,4 +1,4 @@
-"""Masks of one instant, tested by leaving a view out, and mended where they fail."""
+"""Masks of one instant are compared with the others' hull, and corrected if they fail."""
 
 import dataclasses
 
@@ -20,8 +20,7 @@ def figure(views=4, **options):
 
 
 def capture(of, name="0", seed=None, masks=None, shift=0):
-    """An instant of a figure, moved sideways in each photograph,
-    before a background with a pattern."""
+    """An instant of a figure, moved sideways in each photograph, in front of a patterned background."""
     photographs = []
     for view, camera in enumerate(of.names):
         rng = np.random.default_rng(view)
@@ -47,7 +46,7 @@ def without_head(mask):
 
 @pytest.mark.parametrize("options", [{}, {"scale": 1000.0, "origin": (1e5, -2e5, 3e5)}])
 def test_masks_of_one_subject_agree(options):
-    """In any unit and anywhere in the world."""
+    """In any unit of length and at any position in the world."""
     agreement = Agreement.of(capture(figure(**options)))
     assert max(agreement.misses) < MISSED / 2
     assert not agreement.failed.any()
@@ -80,7 +79,7 @@ def test_two_masks_say_nothing():
 
 
 def test_what_a_photograph_cuts_is_not_missed():
-    """Beyond the border of a photograph that cuts the subject its mask says nothing."""
+    """A mask contains no information beyond a border of the photograph that cuts the subject."""
     of = figure()
     given = capture(of)
     first = given.photographs[0]
@@ -92,7 +91,7 @@ def test_what_a_photograph_cuts_is_not_missed():
 
 
 def test_masks_that_fail_are_mended_and_the_others_stay(monkeypatch):
-    """A head that one mask lacks in half of the instants, and an object that another one has."""
+    """A head is missing in one mask in half of the instants, and another mask includes an object."""
     of = figure()
     instants = []
     for number in range(COUNT):

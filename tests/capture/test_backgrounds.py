@@ -1,4 +1,4 @@
-"""Static backgrounds: they mend masks that err in large parts, and leave all others as they are."""
+"""Static backgrounds correct masks with large errors and leave all others unchanged."""
 
 import dataclasses
 
@@ -27,14 +27,14 @@ def behind(seed=0):
 
 
 def parts(number, step=10):
-    """Head and body of the subject at an instant, as masks."""
+    """Masks of the subject's head and body at an instant."""
     middle = 35 + step * number
     head = np.hypot(ROWS - 50, COLUMNS - middle) < 16
     return head, (np.abs(COLUMNS - middle) < 18) & (ROWS > 66) & (ROWS < 170)
 
 
 def instant(number, mask=None, image=None, step=10, shirt=SHIRT, background=None):
-    """The capture of one camera, with some noise."""
+    """A capture of one camera, with noise."""
     head, body = parts(number, step)
     shown = behind() if background is None else background.copy()
     shown[head], shown[body] = SKIN, shirt
@@ -81,14 +81,14 @@ def test_a_part_that_is_left_out_comes_back_and_is_said(capsys):
 
 
 def shaded(image):
-    """A shadow beside the subject of instant 3."""
+    """A shadow next to the subject at instant 3."""
     there = (ROWS > 150) & (COLUMNS > 85) & (COLUMNS < 160) & ~np.logical_or(*parts(3))
     image[there] *= 0.6
     return image
 
 
 def smaller():
-    """A mask that is off by a pixel everywhere: that is for mattes."""
+    """A mask that is off by one pixel everywhere, which is left to the mattes."""
     mask = np.logical_or(*parts(3))
     return mask & np.roll(mask, 2, 0) & np.roll(mask, 2, 1)
 
@@ -113,7 +113,7 @@ def test_masks_that_are_right_are_not_touched(name):
 
 
 def test_what_never_moves_has_no_background():
-    """Behind it there is nothing to see, and beside it all is as ever."""
+    """There is no background behind a static subject; the rest is unchanged."""
     captures = [instant(number, step=0) for number in range(COUNT)]
     _, body = parts(0)
     captures[3] = instant(3, body, step=0)

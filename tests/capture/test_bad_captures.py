@@ -1,5 +1,4 @@
-"""Captures that cannot be read: one line that names the place,
-what was expected and what was found."""
+"""Captures that cannot be read yield one line with the place, what was expected and what was found."""
 
 import json
 import os
@@ -21,7 +20,7 @@ from tests.helpers.figures import Figure
 
 @pytest.fixture
 def place(tmp_path):
-    """A right capture in ``images``."""
+    """A valid capture in ``images``."""
     Figure().write(tmp_path / "images")
     return tmp_path
 
@@ -263,7 +262,7 @@ OTHER_KINDS = ("cam1.HEIC", "cam1.dng", "cam1", "cam1.png.part", "cam1.mp4", "ex
 
 @pytest.mark.parametrize("name", OTHER_KINDS)
 def test_a_photograph_of_another_kind_is_named(place, name):
-    """With three others the fourth was left out without a word."""
+    """With three others, the fourth used to be left out silently."""
     another_kind(place / "images", name)
     said = (
         rf"{re.escape(name)}: expected a file that can be read \(\.jpg, .*; found another kind \(convert it"
@@ -286,7 +285,7 @@ def test_a_photograph_of_another_kind_in_a_cameras_folder_is_named(place, name):
 
 
 def test_what_may_lie_beside_photographs(place):
-    """Raw files, thumbnails and notes of photographs that are read, and files of other names."""
+    """Raw files, thumbnails and notes next to photographs, and files with other names, are ignored."""
     for name in (
         "cam1.dng",
         "cam1.heic",
@@ -311,7 +310,7 @@ def test_further_suffixes_of_kinds_that_are_read(place, suffix):
 
 
 def test_links_in_a_loop_beside_photographs_are_no_matter(place):
-    """A stray link, and a folder that is linked into itself, as backups have."""
+    """A dangling link, and a folder that links to itself, as in backups."""
     (place / "images" / "loop").symlink_to("loop")
     (place / "images" / "again").symlink_to(place / "images")
     folder = CaptureFolder(place / "images", place / "images" / "cameras.json")

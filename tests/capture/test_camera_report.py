@@ -1,4 +1,4 @@
-"""Planted mistakes are named, with the option that mends them; right captures raise no alarm."""
+"""Planted mistakes are reported with the option that corrects them; valid captures are accepted."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def examine(folder, cameras=None, figure=None, **options):
 
 
 def require_mended(folder, found, **calibration):
-    """What the report advises makes the cameras fit."""
+    """The reported option makes the cameras fit."""
     assert not found.consistent
     assert diagnose(CaptureFolder(folder, folder / "cameras.json", calibration=calibration)).consistent
 
@@ -43,7 +43,7 @@ def test_one_camera_that_disagrees_is_named(tmp_path, name):
 
 
 def test_a_camera_that_hangs_upside_down(tmp_path):
-    """Its file is turned by EXIF, its calibration is of the pixels as stored."""
+    """Its photograph is rotated by EXIF, its calibration is for the pixels as stored."""
     figure = Figure()
     exif = Image.Exif()
     exif[0x0112] = 3
@@ -81,7 +81,7 @@ def test_cameras_of_other_photographs(tmp_path, order):
 
 
 def test_exchanged_masks_are_told_from_exchanged_cameras(tmp_path):
-    """Both look alike to the hull; the outlines follow edges of the photographs."""
+    """The hull cannot distinguish them, but outlines follow edges of the right photographs."""
     figure = Figure()
     figure.masks = figure.masks[[0, 2, 1, 3]]
     found = examine(tmp_path, figure=figure)
@@ -115,7 +115,7 @@ def test_units_are_reported(tmp_path, factor, words):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_right_captures_raise_no_alarm(tmp_path, seed):
-    """Any number of cameras, lens and direction, ragged masks, worlds elsewhere and of any unit."""
+    """For any number of cameras, lens and direction, ragged masks, and worlds with any origin and unit."""
     rng = np.random.default_rng(seed)
     focal, scale, origin = rng.uniform(0.9, 1.3), 10.0 ** rng.integers(-1, 4), rng.normal(0, 50, 3)
     width = (96, 128)[seed % 2]
@@ -127,7 +127,7 @@ def test_right_captures_raise_no_alarm(tmp_path, seed):
 
 
 def coarse(photograph, cells):
-    """The silhouette of a photograph in at most ``cells`` along its longer side."""
+    """Silhouette of a photograph with at most ``cells`` pixels along its longer side."""
     shape = np.array(photograph.mask.shape)
     size = np.maximum(np.round(shape * min(cells / shape.max(), 1)).astype(int), 1)
     intrinsics = photograph.intrinsics.copy()
@@ -136,7 +136,7 @@ def coarse(photograph, cells):
 
 
 def test_agreement_is_the_share_of_a_mask_within_the_hull(tmp_path):
-    """Half of a mask that is moved out of the others' sight agrees no more."""
+    """The half of a mask that is moved out of the others' view no longer agrees."""
     figure = Figure()
     right = Figure()
     rows = np.flatnonzero(figure.masks[1].any(1))
@@ -157,7 +157,7 @@ LACKING = {"the head": (0.0, 0.15), "the feet": (0.8, 1.0), "a piece": (0.4, 0.6
 @pytest.mark.parametrize(("view", "seed"), [(0, 0), (1, 3), (2, 7), (3, 0)])
 @pytest.mark.parametrize("part", LACKING)
 def test_a_mask_that_lacks_a_part_is_named_and_the_complete_ones_are_not(tmp_path, view, part, seed):
-    """The others lie outside the hull, and it does not: leaving each out tells."""
+    """The others lie outside of the hull and it does not; leaving each out identifies it."""
     figure = Figure(seed=seed, jitter=0.02)
     rows = np.flatnonzero(figure.masks[view].any(1))
     first, end = (rows[0] + round(share * len(rows)) for share in LACKING[part])
@@ -169,8 +169,8 @@ def test_a_mask_that_lacks_a_part_is_named_and_the_complete_ones_are_not(tmp_pat
 
 
 def test_where_two_views_may_be_wrong_both_are_named(tmp_path):
-    """A part that its opposite alone shows beside the trunk:
-    one mask lacks it or the other has too much."""
+    """A part next to the trunk that only one of two opposite views shows: either one mask lacks it or the
+    other has too much."""
     figure = Figure(seed=4, jitter=0.02)
     left, right = np.flatnonzero(figure.masks[2].any(0))[[0, -1]]
     figure.masks[2][:, : left + 3 * (right + 1 - left) // 10] = False

@@ -1,4 +1,4 @@
-"""From files to the batch of a model and back to the user's world."""
+"""From files to a model's batch, and back to the user's world."""
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ def pixel_of(photograph, point=HEAD):
 
 
 def test_crops_hold_the_subject_and_their_cameras_follow(tmp_path):
-    """A point projects to the same place of the subject before and after the crop."""
+    """A point projects to the same position on the subject before and after the crop."""
     figure = Figure(height=160, width=120)
     capture = Capture.read(tmp_path, figure.write(tmp_path))
     batch = capture.batch((84, 56))
@@ -46,7 +46,7 @@ def test_crops_hold_the_subject_and_their_cameras_follow(tmp_path):
 
 
 def test_a_subject_cut_by_the_border_is_cut_in_the_crop(tmp_path):
-    """Black beyond the border would say that the subject ends there."""
+    """Black beyond the border would look like the end of the subject."""
     figure = Figure()
     figure.images, figure.masks = figure.images[:, :90], figure.masks[:, :90]
     for camera in figure.cameras.values():
@@ -59,7 +59,7 @@ def test_a_subject_cut_by_the_border_is_cut_in_the_crop(tmp_path):
     ("scale", "origin"), [(0.11, (0, 0, 0)), (110.0, (3e3, -2e3, 5e3)), (1.0, (4e5, 5e6, 100))]
 )
 def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
-    """The same photographs in another unit and place give the same Gaussians there."""
+    """The same photographs in another unit and origin yield the same Gaussians there."""
     model = Predictor(make_model("model=hull").eval())
     first = Capture.read(tmp_path / "a", Figure().write(tmp_path / "a"))
     other = Capture.read(tmp_path / "b", Figure(scale=scale, origin=origin).write(tmp_path / "b"))
@@ -95,8 +95,7 @@ def _center(photograph):
 @pytest.mark.parametrize("orientation", [3, 6, 8])
 @pytest.mark.parametrize("calibrated", ["shown", "stored"])
 def test_exif_turns_do_not_move_the_subject(tmp_path, orientation, calibrated):
-    """A phone stores pixels as its sensor has them;
-    calibrations are of these or of the turned ones."""
+    """Phones store pixels in the sensor's orientation; calibrations are for these or for the rotated ones."""
     figure = Figure()
     path = figure.write(tmp_path)
     right = Capture.read(tmp_path, path)
@@ -121,7 +120,7 @@ def test_exif_turns_do_not_move_the_subject(tmp_path, orientation, calibrated):
 
 
 def _stored(camera, turns):
-    """The camera of the stored pixels, of the photograph turned back."""
+    """Camera of the stored pixels, from that of the upright photograph."""
     width, height = camera["width"], camera["height"]
     k, e = np.array(camera["intrinsics"]), np.array(camera["extrinsics"])
     for _ in range(turns):  # back, clockwise: new x = height - old y, new y = old x
@@ -156,8 +155,7 @@ def test_masks_come_from_many_places(tmp_path, source):
 
 
 def test_soft_masks_are_mattes(tmp_path):
-    """Grey values of a mask are shares; the background has no part in what a model sees
-    of the rim."""
+    """Grey values of a mask are coverage; the background does not contribute to the rim in model inputs."""
     figure = Figure()
     path = figure.write(tmp_path)
     sharp = Capture.read(tmp_path, path).batch((42, 42))
@@ -176,7 +174,7 @@ def test_soft_masks_are_mattes(tmp_path):
 
 @pytest.mark.parametrize("fisheye", [False, True])
 def test_undistorted_photographs_are_pinhole_photographs(fisheye):
-    """Where the grid reads a pixel is where OpenCV's model of the lens projects its ray."""
+    """The grid samples a pixel where OpenCV's lens model projects its ray."""
     camera = rig()["cam_01"]
     distortion = np.array([0.05, -0.02, 0.003, 0.004]) if fisheye else camera["D"] * 5
     k = camera["K"] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
@@ -212,7 +210,7 @@ def test_a_lens_is_not_read_beyond_where_its_model_turns_back(lens, fisheye, tur
 
 
 def test_a_bent_photograph_is_straightened(tmp_path):
-    """OpenCV bends the photographs of a pinhole camera; reading them undoes it."""
+    """OpenCV distorts photographs of a pinhole camera; reading undoes it."""
     figure = Figure()
     distortion = [-0.2, 0.05, 0.002, -0.001, 0.0]
     straight = Capture.read(tmp_path, figure.write(tmp_path))

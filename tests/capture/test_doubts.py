@@ -1,5 +1,4 @@
-"""What a capture contradicts is mended by itself;
-an exact capture is predicted as it is, to the bit."""
+"""``auto`` corrects what a capture contradicts; an exact capture is predicted unchanged, bit for bit."""
 
 import dataclasses
 import re
@@ -27,7 +26,7 @@ def taken(tmp_path):
 
 
 def with_outlines(capture, pixels):
-    """Masks that are larger than the subject by so many pixels of their photographs."""
+    """Enlarge the masks by a number of pixels of their photographs."""
     grown = tuple(
         dataclasses.replace(one, matte=(255 * (signed_distance(one.mask) > -pixels)).astype(np.uint8))
         for one in capture.photographs
@@ -36,7 +35,7 @@ def with_outlines(capture, pixels):
 
 
 def with_first_camera(capture, turn=0.0, zoom=1.0):
-    """The first camera turned by so many pixels, or with another focal length."""
+    """Turn the first camera by a number of pixels, or change its focal length."""
     one = capture.photographs[0]
     angle = turn / one.intrinsics[0, 0]
     rotation = np.eye(4)
@@ -48,7 +47,7 @@ def with_first_camera(capture, turn=0.0, zoom=1.0):
 
 @pytest.mark.parametrize("pixels", [-6, -3, -1.5, 1.5, 3, 6])
 def test_masks_that_are_too_large_or_too_small_are_doubted(taken, pixels):
-    """By pixels of the crops, which are 0.42 of those of the photographs; inside is above 0."""
+    """In pixels of the crops, 0.42 of those of the photographs; positive inwards."""
     doubt = doubt_of_masks(with_outlines(taken, pixels), SIZE)
     found = [float(number) for number in re.findall(r"[+-]\d\.\d", doubt)]
     assert found == pytest.approx([0.42 * pixels] * 4, abs=0.55)
@@ -67,8 +66,7 @@ def test_a_camera_that_is_off_is_doubted(taken, changes):
 
 
 def test_one_camera_that_is_off_by_little_is_doubted_and_named(taken):
-    """By two pixels of the photographs, 0.9 of the crops:
-    the others agree without it or its opposite."""
+    """By two pixels of the photographs, 0.9 of the crops; the others agree without it or its opposite."""
     wrong = with_first_camera(taken, turn=2.0)
     doubt = doubt_of_cameras(wrong, wrong.batch(SIZE))
     missed, without = (float(number) for number in re.findall(r"by (0\.\d+)", doubt))
@@ -79,7 +77,7 @@ def test_one_camera_that_is_off_by_little_is_doubted_and_named(taken):
 @pytest.mark.parametrize("views", [3, 4, 5])
 @pytest.mark.parametrize("height", [80, 256])
 def test_exact_captures_are_not_doubted(tmp_path, views, height):
-    """Also photographs that are smaller than their crops, and any unit."""
+    """Also for photographs smaller than their crops, and in any unit."""
     figure = Figure(views, height, height * 3 // 4, seed=views, scale=1000.0)
     exact = Capture.read(tmp_path, figure.write(tmp_path))
     assert doubt_of_masks(exact, SIZE) == ""
@@ -100,7 +98,7 @@ def test_an_exact_capture_is_predicted_as_it_is(taken):
 
 
 def test_what_is_doubted_is_refined(taken, monkeypatch):
-    """As if it had been asked for; 0 leaves it, and cameras are judged by the refined masks."""
+    """As with explicit options; 0 disables it, and cameras are judged by the refined masks."""
     model, wrong = Predictor(make_model("model=hull").eval()), with_outlines(taken, 5)
     seen = []
     monkeypatch.setattr(predicting, "doubt_of_cameras", lambda capture, batch: seen.append(batch) or "")

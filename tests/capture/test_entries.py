@@ -1,5 +1,5 @@
-"""Entries and names of calibrations as programs and systems spell them: lenses under every name, types,
-one meaning each, and a note of the others."""
+"""Entries and names of calibrations in the spellings of programs and systems: lenses under every name,
+types, unique meanings, and a warning about unread entries."""
 
 import json
 import os
@@ -73,7 +73,7 @@ def test_a_lens_that_is_not_read_is_refused(tmp_path, entries, line):
 
 @pytest.mark.filterwarnings("ignore:cameras. entries that are not read. k$")
 def test_entries_that_say_the_same_twice(tmp_path):
-    """A matrix beside coefficients that are 0, one lens in two forms, and sizes that agree."""
+    """A matrix with coefficients that are 0, one lens in two forms, and sizes that agree."""
     lens = {"D": LENS, "dist": [LENS], "k1": LENS[0], "k3": LENS[4], "k": [0, 0]}
     size = {"width": 640, "height": 480, "image_size": [640.0, 480.0]}
     camera = one_camera(tmp_path, camera_matrix=CAMERA["K"], fisheye=0, is_fisheye=False, **lens, **size)
@@ -137,7 +137,7 @@ def test_a_size_in_two_forms_that_differ(tmp_path):
 
 @KINDS
 def test_entries_that_are_not_read_are_named_in_one_note(tmp_path, kind):
-    """Of all cameras and of the file; null is nothing."""
+    """Entries of all cameras and of the file; null counts as missing."""
     entries = {"colour": 3, "gain": None, "lens": "Nikkor 35 mm"}
     if kind == "nerfstudio":
         path = transforms(tmp_path, frame("a.png", **entries), frame("b.png", **entries), units="cm")
@@ -176,7 +176,7 @@ def colmap(tmp_path, *images):
 
 
 def piped(tmp_path):
-    """A pipe among files of COLMAP."""
+    """A named pipe among COLMAP's files."""
     (colmap(tmp_path, (1, "a.jpg")) / "points3D.txt").unlink()
     os.mkfifo(tmp_path / "points3D.txt")
     return tmp_path
@@ -267,7 +267,7 @@ def test_names_of_files_and_cameras(tmp_path, name, text, cameras):
 
 
 def test_values_that_yaml_writes_once(tmp_path):
-    """PyYAML names a list that several cameras have, and refers to it."""
+    """PyYAML writes a list that several cameras share as an anchor with references."""
     text = yaml.dump({name: CAMERA | {"D": LENS} for name in "ab"})
     assert "*id001" in text
     cameras = read_cameras(write(tmp_path / "a.yaml", text)).cameras
@@ -289,7 +289,7 @@ def test_names_with_spaces_in_colmaps_text(tmp_path):
 
 
 def test_caliscope(tmp_path):
-    """Tables below ``cameras``; a camera that was left out has no matrices."""
+    """Tables below ``cameras``; an ignored camera has no matrices."""
     text = "".join(
         f"[cameras.{n}]\nport = {n}\nrotation_count = 0\nsize = [640, 480]\nmatrix = {CAMERA['K']}\n"
         f"distortions = {LENS}\ntranslation = {CAMERA['T']}\nrotation = [0.0, 0.1, 0.0]\n"

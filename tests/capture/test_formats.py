@@ -1,4 +1,4 @@
-"""Files of cameras that other programs wrote, read back to the same projection."""
+"""Camera files written by other programs are read to the same projection."""
 
 import json
 from typing import get_args
@@ -27,7 +27,7 @@ ANIPOSE = FIXTURES / "cameras" / "anipose.toml"
 
 
 def expected(camera) -> np.ndarray:
-    """By OpenCV from the rig itself; centres at +0.5 as this package has them."""
+    """Projections by OpenCV from the rig, with pixel centres at +0.5."""
     return opencv_pixels(POINTS, camera["R"], camera["T"], camera["K"], camera["D"]) + 0.5
 
 
@@ -38,7 +38,7 @@ def projected(calibration: Calibration, points=POINTS) -> np.ndarray:
 
 
 def check(path, points=POINTS, cameras=None):
-    """Every camera of the file projects as the rig's does."""
+    """Check that every camera of a file projects like the rig's."""
     found, cameras = read_cameras(path), cameras or rig()
     assert list(found.cameras) == list(cameras)
     for stored, camera in zip(found.cameras.values(), cameras.values(), strict=True):
@@ -91,7 +91,7 @@ QUALISYS = """<camera serial="{name}"><fov_video left="{left}" top="{top}" right
 
 
 def qualisys(path):
-    """Millimetres, 1/64 pixels, y up and z backward, a part of the sensor, as its program writes them."""
+    """Qualisys' file: millimetres, 1/64 pixels, y up and z backward, a part of the sensor."""
     cameras = ""
     left, top = 16, 8
     for name, camera in rig().items():
@@ -130,7 +130,7 @@ def test_own_json_has_the_size_of_photographs(tmp_path):
 
 @pytest.mark.parametrize("place", ["", "intri.yml", "extri.yml"])
 def test_easymocap(tmp_path, place):
-    """Both the rotation vector R and the matrix Rot are written; numbers are names, too."""
+    """Both the rotation vector R and the matrix Rot are written; numbers are valid names."""
     cameras = {name.removeprefix("cam_"): c for name, c in rig().items()}
     lens, poses = {"names": list(cameras)}, {"names": list(cameras)}
     for n, c in cameras.items():
@@ -156,7 +156,7 @@ COLMAP = {
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_colmap(tmp_path, binary):
-    """Models as COLMAP itself writes them; its own projection is what counts."""
+    """Models written by COLMAP itself, compared with its own projection."""
     model = pycolmap.Reconstruction()
     for i, ((kind, params), c) in enumerate(zip(COLMAP.items(), 3 * list(rig().values()), strict=False), 1):
         model.add_camera_with_trivial_rig(
@@ -177,8 +177,7 @@ def test_colmap(tmp_path, binary):
 
 
 def test_nerfstudio():
-    """Converted from a COLMAP model by nerfstudio's own code,
-    which turns the world and leaves out k3."""
+    """Converted from a COLMAP model by nerfstudio's own code, which rotates the world and omits k3."""
     path = FIXTURES / "cameras" / "transforms.json"
     turn = np.array(json.loads(path.read_text())["applied_transform"])
     cameras = {name: c | {"D": c["D"][:4]} for name, c in rig().items()}
@@ -204,8 +203,8 @@ def test_intrinsics_of_nerfstudio(tmp_path, content, name, intrinsics):
 
 
 def test_an_angle_of_view_alone_is_of_the_photograph(tmp_path):
-    """NeRF's and Blender's files have no size: the photographs have one,
-    before and after a quarter turn."""
+    """Files of NeRF and Blender have no size: that of the photographs is used, before and after a quarter
+    turn."""
     poses = rig()
     angle, frames = 2 * np.arctan(0.5), []
     for name, camera in poses.items():
@@ -255,7 +254,7 @@ def pose_of(camera):
 
 @pytest.mark.parametrize("turns", [1, 2, 3, 4, -1])
 def test_a_turned_photograph_turns_its_camera(turns):
-    """A spot of the photograph is where the turned camera says, after ``numpy.rot90``."""
+    """After ``numpy.rot90``, a point of the photograph lies where the rotated camera projects it."""
     camera = rig()["cam_01"]
     lens = camera["K"] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     straight = Calibration(lens, pose_of(camera), np.zeros(0), False)
@@ -270,7 +269,7 @@ def test_a_turned_photograph_turns_its_camera(turns):
 
 @pytest.mark.parametrize("extrinsics", ["world_to_camera", "camera_to_world"])
 def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
-    """A rig in millimetres: cameras stand a thousandth as far away."""
+    """A rig in millimetres: distances of cameras are a thousandth."""
     pose = pose_of(rig()["cam_01"])
     metres, millimetres = (
         extrinsics_of(pose, Convention(extrinsics=extrinsics, unit=unit)) for unit in (1.0, 0.001)
@@ -281,8 +280,7 @@ def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
 
 @pytest.mark.parametrize("extrinsics", ["world_to_camera", "camera_to_world"])
 def test_rotations_of_seven_digits_far_away(extrinsics):
-    """The centre was 9 mm from where the camera projects from,
-    and an image changed by up to 0.02."""
+    """Otherwise the centre is 9 mm from the centre of projection, and an image changes by up to 0.02."""
     rotation, center = rig()["cam_01"]["R"].round(7), np.array([1e5, -3e4, 1e4])
     pose, around = np.eye(4), center + POINTS
     pose[:3, :3] = rotation if extrinsics == "world_to_camera" else rotation.T

@@ -1,4 +1,4 @@
-"""Instants of a sequence: which count, and what goes wrong in some of them."""
+"""Instants of a sequence: selection, and errors in some of them."""
 
 import re
 import shutil
@@ -111,7 +111,7 @@ def test_photographs_are_not_synchronised(place):
 
 
 def test_cameras_that_are_exchanged_half_way(place, capsys):
-    """The first half is right: what follows is said, with which of them, and nothing is refused."""
+    """Errors of later instants are reported with their cameras, and raised only if all instants have them."""
     check_cameras(opened(place))
     assert "masks do not fit" not in capsys.readouterr().out
     for folder, frames in (("images", frames_of), ("masks", lambda camera: [mask(camera)] * FRAMES)):
@@ -138,7 +138,7 @@ def test_cameras_that_no_instant_can_check_are_said(place, capsys, monkeypatch):
 
 
 def test_two_people_are_said(place, capsys):
-    """They are read as one subject, and a line names the masks that show them apart."""
+    """They are read as one subject, and a line lists the masks with two parts."""
     k, pose = (
         torch.tensor([FIGURE.cameras[name][key] for name in FIGURE.names])[None].double()
         for key in ("intrinsics", "extrinsics")

@@ -1,4 +1,4 @@
-"""Instants of a capture as data: of its cameras each in turn is the target of the others."""
+"""Instants of a capture as a data set, in which each camera in turn is the target."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ NAMES = ["a", "b", "c", "d"]
 
 
 def sequence(place, instants=3, views=4, masks=True):
-    """A folder for each instant of a figure of other colours, and its cameras."""
+    """A folder for each instant, with a figure in different colours, and the cameras."""
     figure = Figure(views=views, height=96, width=96)
     for number in range(instants):
         images = figure.images.copy()
@@ -55,8 +55,7 @@ def written(tmp_path):
 
 
 def require_crop(batch, crops, name):
-    """Which camera is the target: inputs and target are the crops of an instant,
-    each camera once."""
+    """Check that inputs and target are the crops of an instant, each camera once; return the target."""
     seen = torch.cat((batch.images, batch.targets.images), 1)[0]
     lenses = torch.cat((batch.cameras.intrinsics, batch.targets.cameras.intrinsics), 1)[0]
     poses = torch.cat((batch.cameras.extrinsics, batch.targets.cameras.extrinsics), 1)[0]
@@ -121,7 +120,7 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path, capsys, instants, view
 
 
 def test_weights_learn_from_instants_and_an_interrupted_run_goes_on(tmp_path, monkeypatch, capsys):
-    """What is prepared once is not prepared again."""
+    """Instants are prepared only once."""
     run, out = tmp_path / "run", tmp_path / "mine.ckpt"
     command = ["adapt", *sequence(tmp_path), f"out={out}", f"hydra.run.dir={run}", f"data.size={SIZE}"]
     command += ["trainer.max_steps=2", "evaluation.pictures=0"]

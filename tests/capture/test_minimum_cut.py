@@ -1,4 +1,4 @@
-"""The minimum cut: the labels of least energy among all, and pixels that are decided without it."""
+"""The minimum cut: labels of minimal energy, and pixels that are decided by their evidence."""
 
 import itertools
 
@@ -9,7 +9,7 @@ from ghgs_capture.minimum_cut import NEIGHBOURS, minimum_cut, neighbour_pairs
 
 
 def value(labels, evidence, costs):
-    """What the cut maximises, for labels [..., h, w]."""
+    """Objective that the cut maximises, for labels [..., h, w]."""
     chosen = (labels * evidence).sum((-2, -1))
     for step, cost in zip(NEIGHBOURS, costs, strict=True):
         first, second = neighbour_pairs(np.moveaxis(labels, (-2, -1), (0, 1)), step)
@@ -19,8 +19,7 @@ def value(labels, evidence, costs):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_other_labels_have_more(seed):
-    """Against all 2^12 labels of a small grid;
-    some of its pixels are decided by their evidence alone."""
+    """Compared with all 2^12 labels of a small grid; evidence alone decides some of its pixels."""
     rng = np.random.default_rng(seed)
     shape = 3, 4
     evidence = rng.normal(0, 4, shape)

@@ -1,4 +1,4 @@
-"""Photographs and masks under the names of other systems, and masks as other programs draw them."""
+"""Photographs and masks with names of other systems, and masks of other programs."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from tests.helpers.figures import Figure
 
 @pytest.fixture
 def capture(tmp_path):
-    """Photographs in ``images``, masks in ``masks``, the calibration beside them."""
+    """Photographs in ``images``, masks in ``masks``, and the calibration next to them."""
     figure = Figure()
     path = figure.write(tmp_path / "images")
     path.rename(tmp_path / "cameras.json")
@@ -37,7 +37,7 @@ def read(capture, **options):
 
 
 def require_right(photographs):
-    """All four, with their own masks."""
+    """Check that all four photographs are read with their own masks."""
     for photograph, mask in zip(photographs, Figure().masks, strict=True):
         np.testing.assert_array_equal(photograph.mask, mask)
 
@@ -111,7 +111,7 @@ ALPHA = "{camera}-{n}", "{camera}_{n}.alpha", ["0", "1"]
     ],
 )
 def test_names_that_repeat_camera_and_kind(capture, place, masks, names):
-    """In folders of cameras, or all in one; masks beside photographs or in a folder of their own."""
+    """In folders of cameras or all in one; masks next to photographs or in a separate folder."""
     photograph, mask, instants = names
     for path in sorted((capture / "images").glob("*.png")):
         sources = ((place, photograph, path), (masks, mask, capture / "masks" / path.name))
@@ -171,7 +171,7 @@ def test_the_folder_of_a_single_file_of_cameras(capture, files, line):
 
 
 def test_a_capture_with_an_angle_of_view_alone(capture):
-    """Masks and cameras of NeRF's file agree as with a size, also for the report."""
+    """Masks and cameras of NeRF's file agree as with a size, also in the report."""
     own = json.loads((capture / "cameras.json").read_text())["cameras"]
     flip = np.diag([1.0, -1, -1, 1])
     frames = [
@@ -189,8 +189,7 @@ def test_a_capture_with_an_angle_of_view_alone(capture):
 
 
 def test_a_turned_photograph_of_a_calibration_without_size(capture):
-    """As shown, as OpenCV turns photographs: the report took it as stored,
-    and accused the cameras."""
+    """The calibration is for the photograph as shown, since OpenCV rotates photographs on reading."""
     own = json.loads((capture / "cameras.json").read_text())["cameras"]
     without = {n: {k: c[k] for k in ("intrinsics", "extrinsics")} for n, c in own.items()}
     write(capture / "cameras.json", {"cameras": without})
@@ -205,7 +204,7 @@ def test_a_turned_photograph_of_a_calibration_without_size(capture):
 
 
 def test_cameras_that_differ_by_case_alone(capture):
-    """Exact names count, and no other is guessed."""
+    """Exact names are used, and no other is guessed."""
     renamed(capture, lambda name: {"cam2": "CAM1"}.get(name, name))
     rename(capture, "images", lambda n: n.replace("cam1", "Cam1").replace("cam2", "CAM1"))
     with pytest.raises(InputError, match=r"expected photographs named after cameras .*; found Cam1$"):
@@ -237,7 +236,7 @@ def one_folder_down(capture, name):
 
 @pytest.mark.parametrize("name", ["001", unicodedata.normalize("NFD", "K\u00e4the")])
 def test_an_instant_beside_hidden_folders(capture, name):
-    """Jupyter's, and a name of macOS, whose umlaut has two characters."""
+    """Jupyter's hidden folders, and a name of macOS with a decomposed umlaut."""
     one_folder_down(capture, name)
     hidden = capture / "images" / ".ipynb_checkpoints"
     hidden.mkdir()
@@ -273,7 +272,7 @@ def test_mattes_of_files(tmp_path, name):
 
 @pytest.mark.parametrize("turns", [1, 3])
 def test_a_mask_of_the_stored_pixels_is_turned_as_its_photograph(tmp_path, turns):
-    """Photographs of phones are turned when they are read; their masks may be stored either way."""
+    """Photographs of phones are rotated on reading; their masks may be stored either way."""
     stored = np.zeros((4, 6), np.uint8)
     stored[0, :2] = 255
     shown = np.rot90(stored, turns)

@@ -1,5 +1,4 @@
-"""Cameras and colour gains that several instants share: what is found,
-and the file that says so."""
+"""Cameras and colour gains shared by several instants: estimation, and the file with the results."""
 
 import dataclasses
 import json
@@ -23,7 +22,7 @@ NAMES = [f"cam{v}" for v in range(4)]
 
 
 def some_rig(figure):
-    """Other cameras than the figure's: turned, shifted and zoomed."""
+    """A rig with cameras that differ from the figure's: rotated, shifted and zoomed."""
     extrinsics, turn = {}, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for number, name in enumerate(NAMES):
         pose = np.array(figure.cameras[name]["extrinsics"])
@@ -44,7 +43,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_the_file_of_a_rig_gives_the_corrected_cameras(tmp_path, orientation):
-    """Also of photographs that are turned upright, with a lens that bends."""
+    """Also for photographs that are rotated upright, with lens distortion."""
     figure = Figure()
     cameras = {
         name: {**camera, "distortion": [0.05, -0.01, 0.0, 0.0]} for name, camera in figure.cameras.items()
@@ -74,7 +73,7 @@ def captures(tmp_path, count=4):
 
 
 class Asked:
-    """In place of :class:`CameraRefinement`: notes what it is given, and moves every camera."""
+    """Stub of :class:`CameraRefinement` that records its arguments and moves every camera."""
 
     batches = ()
 
@@ -105,7 +104,7 @@ def model():
 def test_auto_corrects_where_half_of_the_instants_contradict(
     tmp_path, monkeypatch, asked, model, doubted, corrected
 ):
-    """One instant with a wrong mask does not move the cameras of all."""
+    """One instant with a wrong mask does not change the cameras of all."""
     monkeypatch.setattr(
         rig_module, "doubt_of_cameras", lambda capture, batch: "they miss" * (int(capture.name) < doubted)
     )
@@ -131,7 +130,7 @@ def test_an_instant_that_lacks_a_camera_takes_no_part(tmp_path, asked, model):
 
 
 def test_a_camera_that_most_instants_lack_stays_as_it_is(tmp_path, asked, model):
-    """It is in the file of the rig, too: the next capture may have it."""
+    """It is also in the file of the rig, since the next capture may contain it."""
     whole = captures(tmp_path)
     three = [Capture(c.name, c.photographs[:3]) for c in whole[:3]]
     rig = corrected_rig([*three, whole[3]], model, (56, 56), 3, 0, Renderer())
@@ -150,7 +149,7 @@ GAINS = GAINS / np.exp(np.log(GAINS).mean(0))
 
 
 def seen_with(path, gains, seed=0):
-    """A figure's photographs, which no gain makes too bright, by cameras with these gains."""
+    """Photographs of a figure by cameras with these gains, without overexposure."""
     figure = Figure(seed=seed)
     dim = np.round((60 + 0.45 * figure.images) * np.reshape(gains, (-1, 1, 1, 3)))
     figure.images = dim.astype(np.uint8)
@@ -158,7 +157,7 @@ def seen_with(path, gains, seed=0):
 
 
 def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, asked, model, monkeypatch):
-    """Of three instants one has other exposures, which does not count."""
+    """One of three instants has other exposures, which are ignored."""
     for instant, gains in enumerate((GAINS, GAINS, GAINS[::-1])):
         cameras = seen_with(tmp_path / "images" / str(instant), gains, seed=instant)
     folder = CaptureFolder(tmp_path / "images", cameras)
@@ -188,7 +187,7 @@ def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, ask
 
 
 def test_gains_of_some_cameras_alone_are_not_used(tmp_path):
-    """An instant then finds them itself, from photographs as they are, to the bit."""
+    """Each instant then estimates them from unchanged photographs, bit for bit."""
     path = seen_with(tmp_path, GAINS)
     cameras = json.loads(path.read_text())["cameras"]
     for name, gains in list(zip(NAMES, GAINS.tolist(), strict=True))[:3]:
@@ -212,7 +211,7 @@ def test_gains_of_some_cameras_alone_are_not_used(tmp_path):
     ],
 )
 def test_gains_are_bounded_with_a_mean_of_one(tmp_path, monkeypatch, model, each, expected):
-    """Too large ones of all cameras shrink alike, so that files that are written can be read."""
+    """Excessive gains are reduced equally for all cameras, so that written files are readable."""
     batch = captures(tmp_path, 1)[0].batch((56, 56))
     logs = torch.tensor(each)[None, :, None].expand(1, 4, 3)
     monkeypatch.setattr(rig_module, "log_gains", lambda gaussians, batch: logs)
@@ -223,7 +222,7 @@ def test_gains_are_bounded_with_a_mean_of_one(tmp_path, monkeypatch, model, each
 
 
 def test_exposures_that_change_are_left_to_each_instant(tmp_path, monkeypatch, model):
-    """A camera that gets brighter by a third over eight instants; noise of 2 % is none."""
+    """A camera that gets brighter by a third over eight instants; noise of 2 % is not a change."""
     batch = rig_module._together([capture.batch((56, 56)) for capture in captures(tmp_path, 8)])
     logs = torch.zeros(8, 4, 3)
     logs[:, 1] = torch.linspace(0, 0.3, 8)[:, None]

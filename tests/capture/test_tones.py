@@ -1,5 +1,4 @@
-"""A camera with a tone curve of its own is named and its photographs are mended;
-others stay as they are."""
+"""A camera with a different tone curve is found and its photographs are corrected; others are unchanged."""
 
 import dataclasses
 import json
@@ -24,7 +23,7 @@ def taken(tmp_path_factory):
 
 
 def seen_with(capture, gammas, gains=(1, 1, 1, 1)):
-    """The capture with photographs whose colours are to these powers, times these gains."""
+    """Apply powers and gains to the colours of a capture's photographs."""
     photographs = []
     for photograph, gamma, gain in zip(capture.photographs, gammas, gains, strict=False):
         colors = np.clip(gain * (photograph.image / 255) ** gamma, 0, 1)
@@ -39,7 +38,7 @@ def but(view, gamma):
 @pytest.mark.parametrize("gamma", [0.8, 1.2])
 @pytest.mark.parametrize("view", range(4))
 def test_the_gamma_of_one_camera_is_named_and_undone(taken, view, gamma):
-    """The photographs that the model sees are those without it, up to the estimate and rounding."""
+    """The model's inputs equal those without the gamma, up to estimation and rounding."""
     result = predict(seen_with(taken, but(view, gamma)), **KEYS)
     assert result.tones == {NAMES[view]: pytest.approx(gamma, rel=0.03)}
     right = taken.batch((112, 112)).images
@@ -48,7 +47,7 @@ def test_the_gamma_of_one_camera_is_named_and_undone(taken, view, gamma):
 
 @pytest.mark.parametrize("gains", [(1, 1, 1, 1), (0.7, 1, 1, 1), (0.6, 0.9, 1.1, 0.75)])
 def test_equal_tones_stay_as_they_are_whatever_the_exposures(taken, gains):
-    """To the bit: it is the prediction without a look."""
+    """Bit for bit equal to the prediction without the search."""
     given = seen_with(taken, [1.0] * 4, gains)
     found, plain = predict(given, **KEYS), predict(given, **KEYS, tones={})
     assert found.tones == plain.tones == {}
@@ -57,7 +56,7 @@ def test_equal_tones_stay_as_they_are_whatever_the_exposures(taken, gains):
 
 
 def test_channels_that_go_different_ways_are_no_tone_curve(taken):
-    """Coloured light or a wrong white balance, which the other cameras contradict."""
+    """Coloured light or a wrong white balance relative to the other cameras."""
     tinted = seen_with(taken, [1.0, np.array([1.2, 1.2, 1 / 1.2]), 1.0, 1.0])
     assert predict(tinted, **KEYS).tones == {}
 
@@ -75,8 +74,7 @@ def test_two_photographs_do_not_tell_which_one_it_is(taken):
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A folder with two instants of photographs of which cam2 has a gamma of 0.8,
-    and their cameras."""
+    """A folder with two instants, in which cam2 has a gamma of 0.8, and their cameras."""
     monkeypatch.chdir(tmp_path)
     for instant in ("000", "001"):
         figure = Figure()

@@ -1,4 +1,4 @@
-"""Videos of a sequence: right ones and what goes wrong in them."""
+"""Videos of a sequence, valid ones and ones with errors."""
 
 import csv
 import shutil
@@ -29,8 +29,7 @@ from tests.helpers.videos import number_of, write_video
 
 
 def test_videos_are_read_in_order(place):
-    """Every frame with its mask, by instants named by their frames;
-    and the first again after the last."""
+    """Every frame with its mask, in instants named after frames; then the first one again after the last."""
     folder = opened(place)
     assert all_numbers(folder) == {f"{n:06d}": alike(n) for n in range(FRAMES)}
     first = folder.photographs("000000")
@@ -44,8 +43,7 @@ def test_videos_are_read_in_order(place):
 
 @pytest.mark.parametrize("suffix", [".mov", ".mkv", ".avi", ".webm"])
 def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
-    """With frames that are stored in another order than shown,
-    sought from the end to the beginning."""
+    """Frames are stored in another order than shown, and read from the end to the beginning."""
     options = {"codec": "libvpx"} if suffix == ".webm" else {"codec": "libx264"}
     path = tmp_path / f"a{suffix}"
     write_video(path, frames_of(0), **options)
@@ -58,8 +56,7 @@ def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
 
 
 def test_frames_that_were_cut_off_do_not_count(tmp_path):
-    """A phone that cuts a video leaves the frames before in its file,
-    and says that they are not shown."""
+    """A phone that trims a video keeps the earlier frames in its file, marked as not shown."""
     write_video(tmp_path / "whole.mp4", frames_of(0), codec="libx264")
     cut = [get_ffmpeg_exe(), "-v", "error", "-ss", "0.15", "-i", tmp_path / "whole.mp4"]
     subprocess.run([*cut, "-c", "copy", tmp_path / "cut.mp4"], check=True)
@@ -69,7 +66,7 @@ def test_frames_that_were_cut_off_do_not_count(tmp_path):
 
 
 def test_a_long_video_is_sought(tmp_path):
-    """Also where one frame of many is decoded at a time."""
+    """Also if only one frame of many is decoded at a time."""
     rng = np.random.default_rng(0)
     order = rng.permutation(400) % 7
     write_video(tmp_path / "a.mp4", (np.full((16, 16, 3), 30 * n, np.uint8) for n in order), fps=20)
@@ -80,7 +77,7 @@ def test_a_long_video_is_sought(tmp_path):
 
 
 def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
-    """Its instant is predicted from the other three."""
+    """The instant of the dropped frame is predicted from the other three."""
     keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
     write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
     found = all_numbers(opened(place))
@@ -91,8 +88,7 @@ def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
 
 
 def test_masks_of_the_frames_that_there_are(place):
-    """Drawn of one after another they know of no dropped frame:
-    masks of other frames are no use."""
+    """Masks made frame by frame do not count dropped frames: masks of other frames are not used."""
     keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
     write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
     drawn = [np.roll(mask(1), 2 * number, 0) for number in range(FRAMES)]
@@ -154,7 +150,7 @@ def test_videos_that_are_refused(place, name):
 
 
 def test_a_broken_frame(place, capsys):
-    """Of a video whose frames stand alone one that is damaged is left out, and no other."""
+    """In a video with independent frames, only the damaged one is left out."""
     path = place / "images" / "cam1.avi"
     (place / "images" / "cam1.mp4").unlink()
     write_video(path, frames_of(1), codec="mjpeg")
@@ -169,7 +165,7 @@ def test_a_broken_frame(place, capsys):
 
 
 def test_empty_masks_for_a_while(place, capsys):
-    """Of one camera: the others predict. Of two: the instants are left out, and the rest is not."""
+    """For one camera, the others are used; for two, only these instants are left out."""
     for camera, name, last in ((0, "cam0", 1), (1, "cam1", 2)):
         masks = [mask(camera) * (not 1 <= number <= last) for number in range(FRAMES)]
         write_video(place / "masks" / f"{name}.mp4", masks)
@@ -203,7 +199,7 @@ def test_masks_of_videos_in_folders_count_from_0_or_from_1(place, first):
 
 
 def test_masks_beside_videos_count_where_nothing_else_is_said(place):
-    """Beside photographs they do, too: a background that is given comes first."""
+    """Also next to photographs; a given background takes precedence."""
     for camera, name in enumerate(FIGURE.names):
         shutil.move(place / "masks" / f"{name}.mp4", place / "images" / f"{name}_mask.mp4")
         (place / "backgrounds").mkdir(exist_ok=True)
@@ -218,7 +214,7 @@ def test_masks_beside_videos_count_where_nothing_else_is_said(place):
 
 
 def test_offsets(place):
-    """A camera that began two frames before the others is two frames ahead."""
+    """A camera that started two frames before the others is two frames ahead."""
     found = all_numbers(opened(place, sequence={"sync": {"cam1": 2}}))
     assert found == {f"{n:06d}": alike(n) | {"cam1": n + 2} for n in range(4)}
     found = all_numbers(opened(place, sequence={"sync": {"cam1": -2, "cam2": 1}}))
@@ -232,8 +228,8 @@ def write_csv(place, rows, header=("camera", "frame", "seconds")):
 
 
 def test_time_stamps(place):
-    """The nearest frame; a frame that is too far is missing,
-    and its instant is predicted without it."""
+    """The nearest frame is used; one that is too far counts as missing, and its instant is predicted
+    without it."""
     late = {"cam0": 0.0, "cam1": 0.04, "cam2": -0.2, "cam3": 0.0}
     rows = [(c, n, n / FPS + late[c]) for c in FIGURE.names for n in range(FRAMES) if (c, n) != ("cam3", 2)]
     found = all_numbers(opened(place, sequence=write_csv(place, rows)))

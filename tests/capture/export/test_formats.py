@@ -1,4 +1,4 @@
-"""Gaussians in each format, read by programs that are not ours, and rendered again."""
+"""Gaussians in each format are read by other programs and rendered again."""
 
 import base64
 import gzip
@@ -36,7 +36,7 @@ def gaussians():
 
 
 def decibels(found: Gaussians, wanted: Gaussians) -> float:
-    """The least PSNR of two views."""
+    """Lower PSNR of two views."""
     cameras = camera_ring(2, 100, 80)
     images = [render(g, cameras, backend="cpu").image.flatten(0, 1) for g in (found, wanted)]
     assert images[1].max() > 0.5
@@ -44,13 +44,13 @@ def decibels(found: Gaussians, wanted: Gaussians) -> float:
 
 
 def read_back(data: bytes, name: str, path) -> Gaussians:
-    """The content of a file as gaussforge reads it."""
+    """Content of a file as read by gaussforge."""
     path.write_bytes(GaussForge().convert(data, name, "ply")["data"])
     return read_ply(path)
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
-    """By scipy, [N, 3, 3]."""
+    """Covariances [N, 3, 3], by SciPy."""
     rotations = Rotation.from_quat(gaussians.quaternions.numpy(), scalar_first=True).as_matrix()
     axes = rotations * gaussians.scales.numpy()[:, None]
     return axes @ axes.swapaxes(-1, -2)
@@ -69,8 +69,8 @@ def test_compact_files_render_alike(gaussians, name, least, tmp_path):
 
 
 def test_spz_has_y_up_and_z_back_as_its_specification_says(gaussians):
-    """Places of the file itself: 24 bits each, after a header of 16 bytes (nianticlabs/spz), are the
-    PLY's with y and z negated; splat-transform, the reader of SuperSplat, negates them again."""
+    """Positions in the file (24 bits each, after a header of 16 bytes; nianticlabs/spz) are the PLY's with y
+    and z negated; splat-transform, the reader of SuperSplat, negates them again."""
     content = gzip.decompress(converted("spz", gaussians))
     count, bits = int.from_bytes(content[8:12], "little"), content[13]
     numbers = np.frombuffer(content[16 : 16 + 9 * count], np.uint8).reshape(count, 3, 3).astype(np.int32)
@@ -82,7 +82,7 @@ def test_spz_has_y_up_and_z_back_as_its_specification_says(gaussians):
 
 
 def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
-    """One file: no address, the Gaussians, the cameras; names cannot end the script."""
+    """A page is one file with Gaussians and cameras and no URL; names cannot end the script."""
     cameras = camera_ring(2, 100, 80)[0]
     # the last two open a second script
     name, wicked = "</title><script>{{data}}", "</script><!--<script>"
@@ -105,7 +105,7 @@ def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
 
 
 def test_a_long_video_is_not_in_memory_as_a_whole():
-    """A picture is made when the one before is written."""
+    """Each frame is rendered after the previous one is written."""
     made, alive = [], []
 
     def pictures():
@@ -122,7 +122,7 @@ def test_a_long_video_is_not_in_memory_as_a_whole():
 
 
 def test_a_video_shows_the_pictures_in_their_colors(tmp_path):
-    """Odd sides are padded; saturated colours come back, and the file says by which matrix."""
+    """Odd sides are padded; saturated colours are preserved, and the file states its colour matrix."""
     bars = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [0, 255, 255], [255, 0, 255]])
     row = np.repeat(bars, 10, axis=0)
     pictures = [
@@ -145,7 +145,7 @@ def test_a_video_shows_the_pictures_in_their_colors(tmp_path):
 
 
 def test_cameras_say_the_height_and_width_of_their_photographs():
-    """Of photographs that are not square, beside PNGs of that size."""
+    """Also for photographs that are not square; the PNGs have the same size."""
     cameras = camera_ring(2, 30, 20)[0]
     images, mattes = torch.rand(2, 3, 30, 20), torch.ones(2, 30, 20)
     names = ("front", "back")

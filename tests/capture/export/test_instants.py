@@ -1,4 +1,4 @@
-"""Files of several instants together, beside the folder of each."""
+"""Files that cover several instants, next to the folder of each."""
 
 import base64
 import dataclasses
@@ -23,8 +23,8 @@ STEP = torch.tensor([0.5, 0.0, 0.1])  # from one instant to the next
 
 
 def walk(count: int) -> list[tuple[Batch, Prediction]]:
-    """Instants of a body that walks steadily out of the first photographs,
-    of less and less Gaussians."""
+    """Instants of a body that walks steadily out of the first photographs, with a decreasing number of
+    Gaussians."""
     cameras, found = camera_ring(3, 60, 60), []
     for number in range(count):
         gaussians = body(1500 - 100 * number, 60)
@@ -42,7 +42,7 @@ def walk(count: int) -> list[tuple[Batch, Prediction]]:
 
 
 def write(directory, instants, *formats) -> Instants:
-    """The files of each instant, then those of all."""
+    """Write the files of each instant, then those of all."""
     options = OutputOptions(formats, frames=1, fps=4)
     together = Instants(len(instants) + 1, options)  # one is left out
     for batch, prediction in instants:
@@ -54,8 +54,8 @@ def write(directory, instants, *formats) -> Instants:
 
 
 def test_a_page_plays_the_instants_and_numbered_plys_are_theirs(tmp_path):
-    """One file for all, no address; the cameras of the first instant,
-    and how the viewer's follows."""
+    """One file for all without a URL, with the cameras of the first instant and the path of the viewer's
+    camera."""
     instants = walk(3)
     together = write(tmp_path, instants, "html", "ply")
     text = (tmp_path / "viewer.html").read_text()
@@ -81,7 +81,7 @@ def test_a_page_plays_the_instants_and_numbered_plys_are_theirs(tmp_path):
 
 
 def test_the_video_shows_all_of_a_subject_that_walks_away(tmp_path):
-    """In the middle of every picture, not cut, and not from one side alone."""
+    """The subject is in the centre of every frame, not cut, and seen from different sides."""
     write(tmp_path, walk(4), "mp4")
     _, *frames = read_frames(str(tmp_path / "instants.mp4"))
     pictures = [np.frombuffer(frame, np.uint8).reshape(720, 720, 3).max(-1) for frame in frames]
@@ -94,8 +94,7 @@ def test_the_video_shows_all_of_a_subject_that_walks_away(tmp_path):
 
 
 def test_files_of_another_origin_stay(tmp_path):
-    """An output replaces no input and nobody's file;
-    those of a longer sequence before are removed."""
+    """Outputs replace neither inputs nor foreign files; files of an earlier, longer sequence are removed."""
     instants = walk(3)
     write(tmp_path, instants, "ply")
     assert {*(path.name for path in (tmp_path / "sequence").iterdir())} == {f"000{n}.ply" for n in range(3)}
@@ -120,8 +119,7 @@ def test_instants_without_files_of_all_get_none(tmp_path):
 
 
 def test_an_empty_instant_does_not_end_the_sequence(tmp_path):
-    """Nobody in the photographs of one instant: the page has none there,
-    the video a black picture."""
+    """For an instant without Gaussians the page shows nothing and the video a black frame."""
     instants = walk(3)
     batch, prediction = instants[1]
     nothing = prediction.gaussians.select(slice(0, 0), (0,))

@@ -1,4 +1,4 @@
-"""Gaussians as few bytes, by our reader and by that of the page."""
+"""Packed Gaussians, unpacked in Python and by the page."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ PIXEL, CENTER = 0.01, torch.tensor([0.1, -0.2, 30.0])
 
 @pytest.fixture
 def gaussians() -> Gaussians:
-    """Of all shapes, colours and directions; 0 and 1 among their numbers."""
+    """Gaussians of varied shapes, colours and directions, including the values 0 and 1."""
     found = body(3000, 120)
     found.colors[:100], found.colors[100:200], found.opacities[50:150] = 0.0, 1.0, 1.0
     return dataclasses.replace(found, means=found.means + CENTER, low_pass=0.1, antialiased=True)
@@ -48,7 +48,7 @@ def test_gaussians_come_back_within_half_a_step_in_their_order(gaussians, steps,
 
 
 def test_floaters_and_scales_of_nothing_stay_finite(gaussians):
-    """The nearest numbers that there are; they cost the others nothing."""
+    """Extreme values are clamped to the nearest ones and do not affect the precision of others."""
     changed = dataclasses.replace(gaussians, means=gaussians.means.clone(), scales=gaussians.scales.clone())
     changed.means[0], changed.scales[1], changed.scales[2] = 1e9, 0.0, 1e9
     found, before = packed_and_back(changed), packed_and_back(gaussians)
@@ -63,7 +63,7 @@ def test_floaters_and_scales_of_nothing_stay_finite(gaussians):
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_the_page_unpacks_the_same(gaussians, tmp_path):
-    """Its own functions, in another program: the shader's table has the numbers of our reader."""
+    """The page's own functions, run outside of a browser: the shader's table equals our reader's values."""
     text = files("ghgs_capture.export").joinpath("page.html").read_text()
     function = re.search(r"function table\(.*?\n}\n", text, re.S)[0]
     packed = pack(gaussians, PIXEL, CENTER, FINE)

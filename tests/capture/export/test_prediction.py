@@ -1,4 +1,4 @@
-"""What is written of a prediction, read by other programs' readers."""
+"""Files of a prediction, read by other programs' readers."""
 
 import dataclasses
 import json
@@ -39,7 +39,7 @@ CONFIG = {"formats": ["ply"], "up": None, "smooth": False, "turntable": {"frames
 
 
 def test_every_photograph_gets_a_file():
-    """Names that differ in signs alone, or in case, which some file systems ignore."""
+    """Names that differ only in special characters, or in case, which some file systems ignore."""
     views = ["left 1", "left_1", "left/1", "Left_1", "left_1_2", "b"]
     names = file_names(views)
     assert len({name.casefold() for name in names}) == len(views)
@@ -54,7 +54,7 @@ def subject():
 
 
 def test_everything_is_written_and_reported(subject, tmp_path):
-    """The report names each file with its size; other programs read depths and photographs."""
+    """The report lists each file with its size; other programs read depths and photographs."""
     batch, prediction = subject
     depth = prediction.depth.detach() + torch.rand(batch.masks.shape)
     prediction = dataclasses.replace(prediction, depth=depth)
@@ -78,8 +78,7 @@ def test_everything_is_written_and_reported(subject, tmp_path):
 
 
 def test_mattes_are_the_alpha_of_the_photographs(subject, tmp_path):
-    """Colours of a PNG are the subject's own;
-    on black they give the photograph that the model saw."""
+    """Colours in a PNG are not premultiplied; on black they yield the model's input."""
     batch, prediction = subject
     share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1)) * batch.masks
     batch = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
@@ -91,7 +90,7 @@ def test_mattes_are_the_alpha_of_the_photographs(subject, tmp_path):
 
 
 def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
-    """With up=z the cameras' up is +z; Gaussians and cameras fit one another as before."""
+    """With up=z the cameras' up is +z; Gaussians and cameras remain consistent."""
     batch, prediction = subject
     write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "inputs"), up="z"))
     gaussians, own = read_ply(tmp_path / "gaussians.ply"), batch.cameras[0]
@@ -110,7 +109,7 @@ UPS = [(0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, -1), (1, 0, 0), (0.6, -0.64, 0.4
 
 @pytest.mark.parametrize("end", AXES)
 def test_a_world_is_turned_as_scipy_turns_it(end):
-    """Opposite directions, too; pictures stay as they were."""
+    """Also for opposite directions; renderings do not change."""
     for up in UPS:
         up = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
         axis = torch.tensor(AXES[end], dtype=torch.float64)
@@ -127,7 +126,7 @@ def test_a_world_is_turned_as_scipy_turns_it(end):
 
 
 def test_gaussians_that_are_not_finite_are_counted_and_left_out(subject, tmp_path):
-    """A viewer fails on a file with NaN; our renderer does not draw such Gaussians."""
+    """Viewers fail on files with NaN; our renderer skips such Gaussians."""
     batch, prediction = subject
     prediction.gaussians.means.data[3, 1] = torch.nan
     write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions())
@@ -138,7 +137,7 @@ def test_gaussians_that_are_not_finite_are_counted_and_left_out(subject, tmp_pat
 
 
 def test_a_subject_without_gaussians_is_written(subject, tmp_path):
-    """Empty masks give empty files and a report without numbers."""
+    """Empty masks yield empty files and a report without numbers."""
     batch, _ = subject
     batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
     options = OutputOptions(("ply", "html", "turntable", "depth", "inputs"), frames=1)
@@ -170,7 +169,7 @@ def test_wrong_options_are_refused(changes, message):
 
 
 def test_options_are_read():
-    """One name, a list with repetitions, and all."""
+    """One name, a list with duplicates, and ``all``."""
     assert output_options(Predict(formats="ply")).formats == ("ply",)
     assert output_options(Predict(formats=["ply", "depth", "ply"])).formats == ("ply", "depth")
     assert "inputs" in output_options(Predict(formats=["all"])).formats
@@ -188,8 +187,7 @@ def test_a_missing_package_is_named_before_any_work(monkeypatch):
 
 @pytest.mark.parametrize(("antialiased", "size"), [(False, 0.3), (True, 1.0)])
 def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size):
-    """At four times the resolution a smooth file shows the same picture, enlarged;
-    another shows dots."""
+    """At four times the resolution, a smooth file renders as the enlarged image; another renders as dots."""
     gaussians, cameras = body(1500, 60), camera_ring(2, 60, 60)
     gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * size, antialiased=antialiased)
     batch, prediction = photographed(gaussians, cameras)
@@ -205,15 +203,14 @@ def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size
 
 
 def made_for_thin_pixels(size: int = 60):
-    """Discs of about a pixel, made for a low-pass of 0.1 px^2 with antialiasing,
-    and their photographs."""
+    """Discs of about a pixel for a low-pass of 0.1 px^2 with antialiasing, and their renderings."""
     gaussians, cameras = body(1500, size), camera_ring(2, size, size)
     gaussians = dataclasses.replace(gaussians, low_pass=0.1, antialiased=True)
     return photographed(gaussians, cameras)
 
 
 def test_other_viewers_draw_what_ours_draws(tmp_path):
-    """They add 0.3 px^2 and are not antialiased: their files make up for it, the PLY says it."""
+    """Other viewers add 0.3 px^2 and do not antialias: their files compensate for it, the PLY states it."""
     batch, prediction = made_for_thin_pixels()
     wanted, boxes = batch.images[0], box_of(batch.masks[0])
     write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "sog"), frames=0))
@@ -229,8 +226,8 @@ def test_other_viewers_draw_what_ours_draws(tmp_path):
 
 
 def test_other_viewers_see_the_inputs_as_ours_does():
-    """Better than scales and opacities alone make it; between the inputs these discs, whose colours
-    are drawn at random, lose less than 1 dB; places and rotations stay."""
+    """The fit is better than with scales and opacities only; between the inputs, discs with random colours
+    lose less than 1 dB; positions and rotations do not change."""
     batch, prediction = made_for_thin_pixels()
     ours = prediction.gaussians
     subject = exported_subject(batch, prediction, Renderer(), OutputOptions())
@@ -250,7 +247,7 @@ def test_gaussians_for_other_viewers_stay_as_they_are():
 
 
 def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
-    """Also where optical axes meet elsewhere: crops have their principal point anywhere."""
+    """Also if optical axes meet elsewhere, since the principal point of crops may be anywhere."""
     gaussians, cameras = body(1500, 60), camera_ring(3, 60, 60)
     # what is photographed is above the point that all cameras look at
     shift = torch.tensor([0.0, 0.7, 0.0])
@@ -271,7 +268,7 @@ def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
 
 
 def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
-    """Files of an earlier prediction stay known over runs that write others."""
+    """Files of an earlier prediction remain listed after runs that write others."""
     batch, prediction = subject
 
     def write(*formats):

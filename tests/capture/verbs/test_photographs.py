@@ -38,7 +38,7 @@ def here(monkeypatch, tmp_path):
 
 @pytest.fixture
 def predict(checkpoint):
-    """The exit code of a prediction by the small model."""
+    """Exit code of a prediction by the small model."""
 
     def run(cameras, *options):
         common = (f"checkpoint={checkpoint}", "turntable.frames=0", "device=cpu", "formats=[ply]")
@@ -54,7 +54,7 @@ def report(folder: Path):
 
 
 def inside_the_figure(path: Path, scale: float = 1.0) -> float:
-    """The share of a splat's Gaussians that lie near the figure, in its world."""
+    """Fraction of a splat's Gaussians near the figure, in its world."""
     vertices = PlyData.read(str(path))["vertex"]
     points = np.stack([vertices[axis] for axis in "xyz"], -1) / scale
     boxes = [(np.abs(points - center) <= np.array(radii) + 0.25).all(-1) for center, radii in PARTS]
@@ -62,8 +62,8 @@ def inside_the_figure(path: Path, scale: float = 1.0) -> float:
 
 
 def test_photographs_become_a_splat_where_the_subject_is(here, predict, capsys, monkeypatch):
-    """In the user's world and unit, with what was done in the report; a read-only working directory
-    is no obstacle, as nothing is written there."""
+    """In the user's world and unit, with corrections in the report; works in a read-only working directory,
+    since nothing is written there."""
     cameras = Figure(scale=1000.0).write(here / "images")
     closed = here / "closed"
     closed.mkdir(mode=0o555)
@@ -86,8 +86,8 @@ def test_photographs_become_a_splat_where_the_subject_is(here, predict, capsys, 
 
 
 def test_cameras_and_masks_are_corrected_where_asked(here, predict, capsys):
-    """The report says by how much; the splat is where the corrected cameras see the subject.
-    Photographs of data sets have nothing beside the subject."""
+    """The report contains the amounts; the splat is where the corrected cameras see the subject.
+    Photographs of data sets show nothing except the subject."""
     figure = Figure(scale=1000.0)
     assert predict(figure.write(here / "images"), "images=images", "out=splat", "refine_cameras=1") == 0
     moved = report(here / "splat")["refine_cameras"]
@@ -107,7 +107,7 @@ def test_cameras_and_masks_are_corrected_where_asked(here, predict, capsys):
 
 
 def test_what_makes_a_prediction_poor_is_said(here, predict, capsys):
-    """Crops that training never showed, and inputs that do not come back."""
+    """Crops unlike those of the training, and input views that are rendered poorly."""
     cameras = Figure().write(here / "images")
     larger = "size: 70 x 70 is larger than the 56 x 56 of the training"
     with pytest.warns(UserWarning, match=larger):
@@ -138,8 +138,8 @@ GAINS = {"cam0": [0.8] * 3, "cam1": [1.25] * 3, "cam2": [1.0, 0.8, 1.25], "cam3"
 
 
 def test_a_rig_is_corrected_once_and_the_next_capture_reads_it(here, predict, capsys, monkeypatch):
-    """What the correction finds (here a shift of each camera, and gains) is in the crops of all
-    instants, and in those of a single instant with the file of the rig."""
+    """The correction (here a shift of each camera, and gains) applies to the crops of all instants, and to
+    those of a single instant with the file of the rig."""
     for instant in ("000", "001", "002"):
         cameras = Figure().write(here / "images" / instant)
     asked = []
@@ -179,8 +179,8 @@ def test_a_rig_is_corrected_once_and_the_next_capture_reads_it(here, predict, ca
 
 
 def test_a_sequence_goes_on_where_an_instant_lacks_photographs(here, predict, capsys):
-    """Three of four predict; two do not, which is said and counted.
-    Of nothing else there is an error."""
+    """Three of four photographs suffice; two do not, which is reported and counted. If no instant is left,
+    it is an error."""
     for instant in ("000", "001", "002"):
         cameras = Figure().write(here / "images" / instant)
     for path in (here / "images" / "000" / "cam0.png", here / "images" / "001" / "cam1.png"):
@@ -232,8 +232,7 @@ def test_the_example_runs(here, checkpoint, monkeypatch, capsys):
 
 
 def test_inputs_are_never_replaced(here, predict, checkpoint, capsys):
-    """Neither a calibration of the name of an output nor photographs,
-    though an earlier run wrote them."""
+    """Neither a calibration with the name of an output nor photographs, even if an earlier run wrote them."""
     assert ghgs("predict", "images=images", f"checkpoint={checkpoint}") == 1
     assert "cameras: expected cameras=<calibration>; found None" in capsys.readouterr().err
     cameras = Figure().write(here / "cap")

@@ -1,4 +1,4 @@
-"""The page to look around in a prediction."""
+"""The viewer of predictions."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ PORT = 18180  # the next free one is taken
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
-    """A prediction whose photographs are renders of its Gaussians."""
+    """Directory of a prediction whose photographs are renderings of its Gaussians."""
     path = tmp_path_factory.mktemp("prediction")
     given = photographed(body(600, 60), camera_ring(3, 50, 60))
     write_prediction(path, *given, Renderer(), OutputOptions(("ply", "inputs")))
@@ -33,7 +33,7 @@ def directory(tmp_path_factory):
 
 
 def test_the_hull_lies_on_the_silhouettes(directory):
-    """Points of the hull are seen inside the (dilated) mask of every view."""
+    """Points of the hull project into the (dilated) mask of every view."""
     content = read_content(directory, None)
     points = torch.from_numpy(content.hull)
     assert len(points) > 100
@@ -99,7 +99,7 @@ def test_the_verb_opens_the_page(directory, tmp_path, capsys):
 
 @pytest.mark.parametrize("host", ["192.0.2.7", "no.such.host.invalid", ".", "a" * 300])
 def test_an_address_of_another_machine_is_named(directory, host):
-    """viser tries a thousand ports of it, and then waits without a word."""
+    """viser would try a thousand of its ports, and then wait silently."""
     with pytest.raises(InputError, match="host: expected an address of this machine; found"):
         Viewer(read_content(directory, None), host, PORT)
 
