@@ -30,7 +30,7 @@ _NOWHERE = -99.0  #: Depth in the others' masks where a ray passes no point
 #: A mask fails if more than this share of it lies outside the hull of the others, or if it removes
 #: more than this share of another mask from that mask's hull.
 MISSED = 0.01
-CORRECTION = 4  #: Pixels by which masks, and rounds by which cameras are corrected
+CORRECTION = 4  #: Pixels by which masks, and rounds in which cameras are corrected
 _REACH = 6  #: Pixels on each side of an outline within which contrast is measured
 #: Mean distance, in pixels of the crop, of mask outlines from image edges above which masks are wrong.
 _OFF = 0.35

@@ -121,7 +121,7 @@ def test_masks_that_fail_are_mended_and_the_others_stay(monkeypatch):
             if view in wrong:
                 assert (after.mask ^ right[view]).sum() < 0.4 * (before.mask ^ right[view]).sum()
     assert len(rounds) > COUNT
-    # Each round has the hulls of its own masks, not of those before they were mended.
+    # Each round uses hulls of the masks corrected so far.
     assert all(a is b for masks, hulls in rounds for a, b in zip(masks, hulls, strict=True))
 
 

@@ -14,7 +14,7 @@ from ghgs_capture.verbs.predict import mended_by
 SIDE, COUNT = 200, 8
 ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE]
 SKIN, SHIRT = (190, 120, 100), (30, 60, 160)
-#: What stands beside the subject's way: its pattern is its own.
+#: An object next to the subject's path, with its own pattern
 OBJECT = (slice(60, 110), slice(115, 145))
 
 

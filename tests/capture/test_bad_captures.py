@@ -93,7 +93,7 @@ LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in pair
 POSE = np.array(Figure().cameras["cam1"]["extrinsics"])
 WIDE = np.zeros((128, 128, 3), np.uint8)
 
-# What is wrong with the folder (a function that may return options), and parts of the line.
+# Damage to the folder (a function that may return options), and parts of the message.
 BAD = {
     "no folder": (
         lambda p: {"images": p / "none"},

@@ -23,13 +23,13 @@ KB = {"camera_model": "pinhole", "D": [0.1, 0.2, 0.3, 0.4]}
 SINGLE = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}
 OWN = {"intrinsics": CAMERA["K"], "extrinsics": np.eye(4).tolist()}
 
-# Entries beside a camera's matrices, and the lens that they mean: coefficients, and whether a fisheye's.
+# Entries next to a camera's matrices, and the lens that they define: coefficients, and whether fisheye.
 LENSES = [
     *(({spelling: LENS}, LENS, False) for spelling in SPELLINGS),
     *(({spelling: [LENS]}, LENS, False) for spelling in SPELLINGS),  # a row of a matrix, as of NumPy
     (dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True)), [*LENS, 0, 0, 0], False),
     (SINGLE | {"is_fisheye": True}, [0.1, 0.2, 0.3, 0.4], True),
-    # Kalibr and ROS say it so, beside a pinhole.
+    # As written by Kalibr and ROS, next to a pinhole.
     *(
         (KB | {"distortion_model": model}, KB["D"], True)
         for model in ("equidistant", "fisheye", "KANNALA_BRANDT", "OPENCV_FISHEYE")
@@ -112,7 +112,7 @@ WRONG_TYPES = [
     ({"D": [0.1, True, 0, 0]}, r"D: expected numbers; found \[0\.1, True"),
     ({"D": "none"}, "D: expected an array"),
     ({"D": {"k1": 0.1}}, "D: expected an array"),
-    # Text and 2 once counted as true: a lens of another model, without a word.
+    # Text and 2 used to count as true, silently selecting another lens model.
     *(
         ({key: value}, f"{key}: expected true or false; found {re.escape(repr(value))}")
         for key in ("fisheye", "is_fisheye")
@@ -240,13 +240,13 @@ def test_a_folder_of_each_camera_names_it(tmp_path):
     assert list(cameras) == ["cam0", "cam1", "cam2"]
     assert cameras["cam1"].mask == tmp_path / "masks" / "cam1" / "0000.png"
     assert list(read_cameras(transforms(tmp_path, *frames)).cameras) == ["cam0", "cam1", "cam2"]
-    # Of a camera that moves every photograph keeps its place.
+    # For a moving camera, every photograph keeps its pose.
     frames[1]["fl_x"] += 1
     assert "images/cam0/0000.png" in read_cameras(transforms(tmp_path, *frames)).cameras
 
 
 ONE = json.dumps({"a": CAMERA})
-# Names of files and their text; the names of the cameras that are read.
+# Names and contents of files; names of the cameras that are read.
 NAMES = [
     ("A.YML", ONE, ["a"]),
     ("b.Yaml", ONE, ["a"]),

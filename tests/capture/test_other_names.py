@@ -76,7 +76,7 @@ def in_view(name):
     return name.replace("cam", "view")
 
 
-# How photographs, masks and cameras are renamed, and options.
+# Renaming of photographs, masks and cameras, and options.
 RENAMED = {
     "masks of Windows": (same, lambda n: n.replace(".png", ".PNG"), same, {}),
     "masks of COLMAP": (same, lambda n: n.replace(".", ".png."), same, {}),

@@ -122,7 +122,7 @@ def with_curve(number):
     return tag
 
 
-# What is wrong with the video of cam1, and the line about it.
+# Damage to the video of cam1, and the message about it.
 REFUSED = {
     "another size": (
         lambda path: write_video(path, (frame[:48] for frame in frames_of(1))),

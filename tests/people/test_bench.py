@@ -1,4 +1,4 @@
-"""The frozen people: their definition, what they look like, and what is refused."""
+"""Frozen people: definition, appearance and rejected settings."""
 
 import functools
 import shutil
@@ -19,7 +19,7 @@ SOME = {split: (bench.names(split)[0], bench.names(split)[-1]) for split in benc
 
 
 class Kept(SyntheticSource):
-    """Each person is generated once for all tests."""
+    """Generate each person once for all tests."""
 
     load = functools.cache(SyntheticSource.load)
 
@@ -39,20 +39,19 @@ def rendered(tmp_path_factory):
 
 
 def test_the_people_look_as_they_were_published(rendered, tmp_path):
-    """If this fails, the people have changed:
-    results on them need another version of the definition."""
+    """A failure means that the people have changed: results on them need a new version of the definition."""
     bench.check_photographs("bench", Layout(rendered, "bench", SOME["bench"]))
     bench.check_photographs("sealed", render(tmp_path, "sealed", bench.definition("sealed")["size"]))
 
 
 @pytest.mark.parametrize("split", bench.SPLITS)
 def test_other_sizes_are_the_same_people(tmp_path, split):
-    """The sets are measured at 140 and 252 pixels, and tried at fewer."""
+    """The sets are used at 140 and 252 pixels, and for trials at fewer."""
     bench.check_photographs(split, render(tmp_path, split, bench.LEAST))
 
 
 def test_another_person_is_refused_by_name(rendered, tmp_path):
-    """Also where only one photograph of one person is wrong."""
+    """Also if only one photograph of one person is wrong."""
     root = tmp_path / "swapped"
     shutil.copytree(rendered, root)
     for kind in ("img", "mask"):
@@ -66,7 +65,7 @@ def test_another_person_is_refused_by_name(rendered, tmp_path):
 
 @pytest.mark.parametrize(("split", "count"), [("bench", 40), ("sealed", 16)])
 def test_the_people_are_different_ones(split, count):
-    """So many, told apart by what is stored of them."""
+    """The number of people, all distinguishable by their thumbnails."""
     assert len(set(bench.names(split))) == len(bench.thumbnails(split)) == count
     flat = bench.thumbnails(split).reshape(count, -1).astype(float)
     apart = np.sqrt(np.square(flat[:, None] - flat).mean(-1))
@@ -74,8 +73,7 @@ def test_the_people_are_different_ones(split, count):
 
 
 def test_nobody_trains_on_them():
-    """The greatest numbers of people that a configuration allows reach neither set,
-    nor one set the other."""
+    """The largest numbers of people in a configuration overlap neither set, and the sets do not overlap."""
     most = datasets.FIRST_VAL - 1
     data = datasets.Synthetic.model_construct(
         people=datasets.People(train=most, val=1),
@@ -107,7 +105,7 @@ def synthetic(tmp_path, *overrides):
     ],
 )
 def test_another_definition_is_refused_before_anything_is_rendered(tmp_path, override, message):
-    """Results on it would be called those of the frozen set."""
+    """Otherwise results on it would be attributed to the frozen set."""
     with pytest.raises(InputError, match=message):
         synthetic(tmp_path, override).prepare_data(["bench"])
     assert not list(tmp_path.iterdir())
@@ -115,7 +113,7 @@ def test_another_definition_is_refused_before_anything_is_rendered(tmp_path, ove
 
 @pytest.mark.parametrize("split", bench.SPLITS)
 def test_only_the_split_that_is_measured_is_rendered(tmp_path, monkeypatch, split):
-    """Forty people take minutes, sixty-four of the training more; the size is free."""
+    """Only the split is rendered: its forty people take minutes, sixty-four of training more; any size."""
     asked = []
     monkeypatch.setattr(datasets, "render_people", lambda root, names, *rest: asked.append(names))
     monkeypatch.setattr(bench, "check_photographs", lambda split, reader: None)
@@ -133,7 +131,7 @@ def test_only_the_split_that_is_measured_is_rendered(tmp_path, monkeypatch, spli
 
 
 def test_thumbnails_are_means_of_photograph_and_mask():
-    """By their definition, with colours that the mask does not weigh."""
+    """Thumbnails by their definition, with colours that are not weighted by the mask."""
     rng = np.random.default_rng(0)
     image, mask = rng.integers(0, 256, (64, 96, 3), dtype=np.uint8), rng.random((64, 96)) > 0.5
     found = bench.thumbnail(View(image, mask, None, np.eye(3), np.eye(4)))

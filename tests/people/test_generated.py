@@ -1,4 +1,4 @@
-"""DataModules from configuration, and generated people: built, cached, extended, refused."""
+"""Data modules from configurations, and generated people: caching, extension, invalid settings."""
 
 from unittest.mock import Mock
 
@@ -26,7 +26,7 @@ def built(*overrides):
 @pytest.mark.parametrize("views", ["v3", "v4", "v5", "random"])
 @pytest.mark.parametrize("targets", ["release", "midway", "random"])
 def test_configuration_groups_build(views, targets, tmp_path):
-    """Every combination of views= and targets= builds; a file's values are the class's defaults."""
+    """Every combination of views= and targets= builds; values in files equal the defaults of classes."""
     data = built("data=scans", f"views={views}", f"targets={targets}")
     assert data.targets.name == targets
     assert data.views.evaluation_count == {"v3": 3, "v4": 4, "v5": 5, "random": 4}[views]
@@ -43,7 +43,7 @@ def test_configuration_groups_build(views, targets, tmp_path):
 
 
 def test_configuration_of_the_rig_is_the_rigs_default():
-    """YAML and code agree about the rig."""
+    """YAML and code define the same rig."""
     data = built("data=scans")
     assert isinstance(data.dataset, Scans)
     assert data.dataset.rig.build() == RIG
@@ -63,7 +63,7 @@ def synthetic(tmp_path, seed=0, **changes):
 
 @pytest.fixture
 def generated(monkeypatch):
-    """Boxes in place of people; the list of what was made."""
+    """Boxes instead of people, and the list of generated ones."""
     made = []
 
     def generate(seed, index, active=False):
@@ -105,7 +105,7 @@ def test_generated_people_are_rendered_once_and_extended(tmp_path, generated):
 
 
 def test_the_cache_is_named_after_every_setting(tmp_path):
-    """Different settings never share a cache; what does not change pixels does."""
+    """Different settings never share a cache, unless they do not change pixels."""
     roots = [
         synthetic(tmp_path, **changes).dataset.root
         for changes in (
@@ -134,19 +134,19 @@ def test_the_cache_is_named_after_every_setting(tmp_path):
     ],
 )
 def test_impossible_people_are_refused(tmp_path, changes, line):
-    """Views that are not rendered, numbers of people, misspelt keys."""
+    """Views that are not rendered, invalid numbers of people, misspelt keys."""
     refused(line, lambda: synthetic(tmp_path, **changes))
 
 
 def test_rig_draws_do_not_depend_on_other_subjects():
-    """A subject looks the same whichever other subjects there are."""
+    """A subject does not depend on the other subjects."""
     a, b = RIG.yaws(subject_rng(0, "a")), RIG.yaws(subject_rng(0, "b"))
     assert not np.allclose(a, b)
     np.testing.assert_array_equal(a, RIG.yaws(subject_rng(0, "a")))
 
 
 def test_a_user_without_a_home_learns_where_to_keep_people(monkeypatch):
-    """Such as ``docker --user 12345``, whom the container does not know."""
+    """Such as ``docker --user 12345``, who has no home directory."""
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.delenv("GHGS_CACHE", raising=False)
     monkeypatch.setattr("pwd.getpwuid", Mock(side_effect=KeyError))

@@ -1,4 +1,4 @@
-"""Rendering jobs: killed half-way, started twice, in several processes, with other settings."""
+"""Rendering jobs: killed halfway, started twice, in several processes, with other settings."""
 
 import errno
 import os
@@ -30,7 +30,7 @@ def contents(root: Path) -> dict[str, bytes]:
 
 @dataclass(frozen=True)
 class Counting:
-    """A source that notes in ``log`` whom it loads, and fails on request."""
+    """A source that logs loaded names in ``log``, and fails on request."""
 
     source: ScanSource
     log: Path
@@ -63,8 +63,7 @@ def reference(scans, tmp_path_factory):
 
 
 def render_and_die(root: Path, scans: Path, moves: int) -> None:
-    """Render until ``moves`` folders or files were moved,
-    then vanish as ``kill -9`` makes one vanish."""
+    """Render until ``moves`` folders or files were moved, then exit as after ``kill -9``."""
     count, replace_file = [0], os.replace
 
     def dying(*paths):
@@ -102,7 +101,7 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_goes_on(scans, referen
 
 @dataclass(frozen=True)
 class Slow:
-    """A source that notes in ``log`` whom it loads; all people are bad."""
+    """A source that logs loaded names in ``log``; all people are invalid."""
 
     log: Path
 
@@ -148,7 +147,7 @@ def test_two_processes_at_once_share_the_work(scans, reference, tmp_path):
 
 @dataclass(frozen=True)
 class Stuck:
-    """A source that notes which process loads, and takes its time."""
+    """A slow source that logs the loading process."""
 
     source: ScanSource
     log: Path
@@ -169,7 +168,7 @@ def render_stuck(root: Path, scans: Path, log: Path) -> None:
 
 
 def lives(pid: int) -> bool:
-    """Whether a process runs; one that waits to be buried does not."""
+    """Whether a process runs; zombies do not."""
     state = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
     return state.strip()[:1] not in ("", "Z")
 
@@ -205,8 +204,7 @@ render_people(root, {"train": ["s0", "s1"]}, ScanSource(scans), Rig(), RenderOpt
 
 
 def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
-    """Its workers run the script again and would wait for their parent, which waits for them,
-    for ever."""
+    """Workers run the script again, and would deadlock with their parent."""
     script, pids = tmp_path / "script.py", tmp_path / "pids"
     script.write_text(UNGUARDED)
     pids.mkdir()
@@ -229,8 +227,7 @@ def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeyp
 
 
 def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_path):
-    """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker,
-    in further processes."""
+    """A sweep with ``hydra/launcher=joblib`` renders in subprocesses of joblib's worker."""
     loky = pytest.importorskip("joblib.externals.loky")
     # Not the executor that joblib shares in a process: it would lack what joblib gives its own.
     with loky.ProcessPoolExecutor(max_workers=1) as worker:
@@ -240,7 +237,7 @@ def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_pat
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_bad_people_are_named_when_the_others_are_rendered(scans, reference, tmp_path, workers, caplog):
-    """An error loses no finished work, no work to come, and leaves no half subject."""
+    """An error loses neither finished nor remaining work, and leaves no incomplete subject."""
     root = tmp_path / "out"
     names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
     source = Counting(ScanSource(scans), tmp_path / "log", fail=("s0", "s2"))
@@ -256,8 +253,8 @@ def test_bad_people_are_named_when_the_others_are_rendered(scans, reference, tmp
 
 
 def test_textures_without_lights_come_back_as_they_are(scans, reference, tmp_path):
-    """Light that is in a texture was there twice.
-    Geometry and cameras are those of the lit photographs."""
+    """Without lights, lighting in textures is not applied twice; geometry and cameras equal those of lit
+    photographs."""
     root, unlit = tmp_path / "out", SMALL.replace(lights="none")
     render_boxes(root, scans, 1, 0, settings=unlit)
     files = contents(root)
@@ -273,8 +270,7 @@ def test_textures_without_lights_come_back_as_they_are(scans, reference, tmp_pat
 
 
 def test_a_full_disk_names_the_folder_of_the_data_set(scans, tmp_path, monkeypatch):
-    """The system names no file, and the command line then named the run's directory,
-    which had space."""
+    """The system's error contains no file, and must not be attributed to the run's directory."""
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -286,7 +282,7 @@ def test_a_full_disk_names_the_folder_of_the_data_set(scans, tmp_path, monkeypat
 
 
 def test_other_settings_and_other_folders_are_refused(scans, tmp_path):
-    """Renders of different settings are never mixed, and no foreign file is touched."""
+    """Renderings with different settings are never mixed, and no foreign file is changed."""
     root = tmp_path / "out"
     render_boxes(root, scans, 1, 0, settings=SMALL)
     before = contents(root)
@@ -317,20 +313,20 @@ def test_other_settings_and_other_folders_are_refused(scans, tmp_path):
     ],
 )
 def test_impossible_settings_fail_at_once(changes, message):
-    """A wrong value fails before rendering starts and names its key."""
+    """An invalid value fails before rendering starts, with its key in the message."""
     with pytest.raises(InputError, match=message):
         TINY.replace(**changes)
 
 
 def test_positions_beyond_the_ring_are_refused(scans, tmp_path):
-    """A position that the ring lacks is refused before anything is written."""
+    """A position that the ring lacks is rejected before anything is written."""
     with pytest.raises(InputError, match=r"data\.render\.positions: expected some of 0 to 15"):
         render_boxes(tmp_path / "out", scans, 1, 0, settings=TINY.replace(positions=(0, 16)))
     assert not (tmp_path / "out").exists()
 
 
 def test_portrait_photographs(scans, tmp_path):
-    """Photographs need not be square: focal length and centre follow the height."""
+    """Photographs need not be square: focal length and centre depend on the height."""
     render_boxes(tmp_path / "out", scans, 1, 0, settings=SMALL.replace(size=(56, 28)))
     view = Layout(tmp_path / "out", "train").read_view("s0", 0, 0, depth=True)
     assert view.image.shape == (56, 28, 3)
@@ -340,8 +336,7 @@ def test_portrait_photographs(scans, tmp_path):
 
 
 def test_two_seeds_of_rendering_differ_and_one_repeats(scans, reference, tmp_path):
-    """Other heights, directions and lights: no photograph and no camera is that of the
-    other seed."""
+    """Heights, directions and lights differ: no photograph and no camera equals that of the other seed."""
     for seed in (0, 1):
         render_boxes(tmp_path / str(seed), scans, 3, 1, settings=SMALL, seed=seed)
     assert contents(tmp_path / "0") == reference

@@ -1,4 +1,4 @@
-"""A miniature is written where nothing else lies: real data of the same names is never touched."""
+"""A miniature is written only where no other files are: real data of the same name is never changed."""
 
 import functools
 
@@ -21,7 +21,7 @@ CASES = {
 
 @pytest.fixture(params=CASES)
 def case(request, tmp_path, monkeypatch):
-    """(make, folder, file of the real data): ``make`` writes that file in place of people."""
+    """(make, folder, file of the real data): ``make`` writes that file instead of people."""
     key, file, module, function = CASES[request.param]
     folder = tmp_path / "data"
 
@@ -41,7 +41,7 @@ def case(request, tmp_path, monkeypatch):
 
 
 def test_real_data_is_not_overwritten(case):
-    """A folder with files that no miniature wrote is refused, and stays as it was."""
+    """A folder with files that no miniature wrote is rejected and unchanged."""
     make, folder, file = case
     file.parent.mkdir(parents=True)
     file.write_text("real")
@@ -63,8 +63,7 @@ def test_a_miniature_can_be_written_again(case):
 
 
 def test_what_lies_beside_is_not_overwritten(tmp_path):
-    """The body model beside HuMMan and the fits beside raw scans are checked like the
-    data itself."""
+    """The body model next to HuMMan and the fits next to raw scans are checked like the data itself."""
     for name, key, beside in (
         ("humman", "root", "data_body_models/smpl/SMPL_NEUTRAL.pkl"),
         ("thuman2", "source", "THuman2.0_smplx/0000/smplx_param.pkl"),

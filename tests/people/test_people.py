@@ -1,4 +1,4 @@
-"""Built-in people: the body model against its definition, and people as users get them."""
+"""Built-in people: the body model, and generated people."""
 
 from importlib.resources import files
 
@@ -27,7 +27,7 @@ MEGABYTE = 2**20
 
 @pytest.fixture(scope="module")
 def people() -> list[Person]:
-    """Eight people of one family, for all tests of people, the last two in motion."""
+    """Eight people of one seed for all tests, the last two in motion."""
     return [generate(7, index, active=index > 5) for index in range(8)]
 
 
@@ -40,7 +40,7 @@ def _all_vertices(person: Person) -> np.ndarray:
 
 
 def test_asset_is_small_and_comes_with_its_licence():
-    """The package stays small, and the licence of the MakeHuman data is shipped with it."""
+    """The package is small, and includes the licence of the MakeHuman data."""
     assets = files("ghgs_people.figures") / "assets"
     assert len((assets / "body.npz").read_bytes()) < 4 * MEGABYTE
     licence = (assets / "LICENSE").read_text()
@@ -109,7 +109,7 @@ def test_shapes_are_adults():
 
 
 def test_same_numbers_same_person(people):
-    """The cache of rendered people relies on it: the same two numbers give the same arrays."""
+    """The same seed and index yield the same arrays, on which the cache of rendered people relies."""
     again = generate(7, 2)
     assert again.name == people[2].name
     standing = generate(7, 6)  # the same person in another pose
@@ -124,7 +124,7 @@ def test_same_numbers_same_person(people):
 
 
 def test_no_two_alike(people):
-    """Other numbers give other shapes, poses and colours."""
+    """Other numbers yield other shapes, poses and colours."""
     people = [*people, generate(8, 2)]
     assert len({person.name for person in people}) == len(people)
     for i, one in enumerate(people):
@@ -134,7 +134,7 @@ def test_no_two_alike(people):
 
 
 def test_stands_on_the_ground_near_the_origin(people):
-    """Camera rigs look at the origin: nobody floats, sinks into the ground or stands beside it."""
+    """Camera rigs look at the origin: nobody floats, sinks into the ground or is off-centre."""
     for person in people:
         vertices = _all_vertices(person)
         assert vertices[:, 1].min() == pytest.approx(0.0, abs=1e-5)
@@ -160,7 +160,7 @@ def test_faces_forward_within_the_yaw(people):
 
 
 def test_arrays_are_finite_and_in_their_types(people):
-    """What is rendered has the documented types and shapes, no NaN and no unused vertices."""
+    """Meshes have the documented types and shapes, no NaN and no unused vertices."""
     for person in people:
         assert person.body_vertices.dtype == np.float32
         assert person.body_vertices.shape == (BODY_VERTICES, 3)
@@ -221,7 +221,7 @@ def test_clothes_cover_the_hips(people):
 
 @pytest.mark.parametrize("active", [False, True])
 def test_arms_stay_out_of_the_trunk(active):
-    """Poses whose arms cut into the trunk are drawn again."""
+    """Poses in which arms intersect the trunk are resampled."""
     body = load_body()
     faces = triangles(body.surfaces["body"].quads)
     depths = []
@@ -234,8 +234,7 @@ def test_arms_stay_out_of_the_trunk(active):
 
 
 def test_people_in_motion_spread_bend_and_cross_their_legs():
-    """What standing people never show: feet a leg's length apart, deep knees,
-    feet on the other's side."""
+    """Poses that standing people never have: feet a leg's length apart, deep knees, crossed feet."""
     body = load_body()
     apart, along, across, high = [], [], [], []
     for active in (False, True):
@@ -262,7 +261,7 @@ def test_people_in_motion_spread_bend_and_cross_their_legs():
 
 @pytest.mark.parametrize(("seed", "index", "key"), [(-1, 0, "seed"), (0, -1, "index")])
 def test_negative_numbers_are_refused(seed, index, key):
-    """The message names the number that is wrong."""
+    """The message contains the invalid number."""
     refused(key, lambda: generate(seed, index))
 
 
@@ -284,8 +283,7 @@ SQUARE = {
     ],
 )
 def test_textured_mesh_refuses_other_shapes(name, array, line):
-    """Arrays that do not fit together are refused when the mesh is made,
-    not when it is rendered."""
+    """Inconsistent arrays are rejected when the mesh is created, not when it is rendered."""
     TexturedMesh(**SQUARE)
     refused(line, lambda: TexturedMesh(**{**SQUARE, name: array}))
 
@@ -294,8 +292,7 @@ def test_textured_mesh_refuses_other_shapes(name, array, line):
 
 
 def test_clip_keeps_the_area_on_its_side():
-    """Garments are cut where their field is zero: both sides make up the area,
-    no face is flipped."""
+    """Garments are cut where their field is zero: both sides add up to the area, no face is flipped."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
     index = np.arange(81).reshape(9, 9)
@@ -317,7 +314,7 @@ def test_clip_keeps_the_area_on_its_side():
 
 
 def test_subdivision_and_smoothing_keep_a_plane():
-    """Finer charts keep the outline and stay flat where the base mesh is flat."""
+    """Finer charts keep the outline, and are flat where the base mesh is flat."""
     quads = np.array([[0, 1, 4, 3], [1, 2, 5, 4]])
     points = np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1.0]])
     operator, fine = subdivide(quads, 6)
@@ -332,7 +329,7 @@ def test_subdivision_and_smoothing_keep_a_plane():
 
 
 def test_rasterise_finds_the_place_of_texels():
-    """Each texel is painted for the place that it is seen at, not for one half a texel away."""
+    """Each texel is painted for its own position, not for one half a texel away."""
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     texels, face, bary, nearest = rasterise(uv, faces, 6, 4)
@@ -344,8 +341,7 @@ def test_rasterise_finds_the_place_of_texels():
 
 
 def test_normals_of_a_sphere():
-    """Clothes are moved along normals: they have unit length,
-    point outwards and weight faces by area."""
+    """Normals, along which clothes are moved, have unit length, point outwards and weight faces by area."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=3)

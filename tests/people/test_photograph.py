@@ -1,4 +1,4 @@
-"""Photographs of analytic shapes: depth, silhouettes, antialiasing, light."""
+"""Renderings of analytic shapes: depth, silhouettes, antialiasing, light."""
 
 import re
 import sys
@@ -35,7 +35,7 @@ def mesh_part(mesh: trimesh.Trimesh, texture=None) -> TexturedMesh:
 
 
 def quad(z=0.0, half=0.5, texture=None, x=0.0) -> TexturedMesh:
-    """A square that faces +z, its texture upright seen from +z."""
+    """A square that faces +z, with its texture upright as seen from +z."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
     vertices = np.concatenate((corners * half + [x, 0], np.full((4, 1), z)), 1).astype(np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -43,7 +43,7 @@ def quad(z=0.0, half=0.5, texture=None, x=0.0) -> TexturedMesh:
 
 
 def front_camera(size=48, distance=2.0, focal=1.0, shift=0.0) -> Cameras:
-    """At (0, 0, distance), looking along -z, y up."""
+    """A camera at (0, 0, distance), looking along -z, y up."""
     extrinsics = torch.diag(torch.tensor([1.0, -1, -1, 1]))
     extrinsics[2, 3] = distance
     intrinsics = torch.tensor([[focal * size, 0, size / 2 + shift], [0, focal * size, size / 2], [0, 0, 1]])
@@ -57,8 +57,7 @@ def shoot(parts, cameras, samples=3, lights=None):
 
 
 def test_sphere_depth_and_coverage_are_analytic():
-    """Depth and coverage are metric: compared with ray-sphere intersection in float64 and
-    dense sampling."""
+    """Depth and coverage agree with ray-sphere intersection in float64 and dense sampling."""
     radius, size, distance = 0.6, 56, 2.0
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     camera = front_camera(size, distance, shift=3.3)
@@ -84,8 +83,7 @@ def test_sphere_depth_and_coverage_are_analytic():
 
 
 def test_square_covers_exactly_the_pixels_it_should():
-    """No shift by half a pixel: edges at pixel boundaries are sharp,
-    others have their exact coverage."""
+    """No shift by half a pixel: edges at pixel boundaries are sharp, others have their exact coverage."""
     size = 32
     image, mask, depth = shoot([quad(half=0.5)], front_camera(size))  # ± 0.5 * 32 / 2 = ± 8 pixels
     expected = np.zeros((size, size))
@@ -106,7 +104,7 @@ def test_square_covers_exactly_the_pixels_it_should():
 
 
 def test_depth_never_mixes_two_surfaces():
-    """At edges the depth is that of one surface, never a mean that floats between two."""
+    """At edges, depth is that of one surface, never a mean between two."""
     near = quad(z=0.5, half=0.2, x=0.05)
     far = quad(z=-0.5, half=0.9)
     for samples in (1, 2, 3, 4):
@@ -133,8 +131,7 @@ def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
 
 
 def test_vertices_project_into_the_mask_from_every_side():
-    """Photographs agree with their cameras: vertices project into the mask,
-    depths lie on the surface."""
+    """Renderings agree with their cameras: vertices project into the mask, depths lie on the surface."""
     rng = subject_rng(3, "capsule")
     capsule = trimesh.creation.capsule(height=1.2, radius=0.25, count=[64, 64])
     capsule.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
@@ -192,9 +189,9 @@ def hits(corners, origins, rays):
 
 
 def photographed(part, camera, samples, light):
-    """Image, matte and depth of a mesh by its formulas: all rays against all faces, in float64.
+    """Image, matte and depth of a mesh by the formulas: all rays against all faces, in float64.
 
-    ``light`` [n, 2] are factors on the texture on both sides of the vertices."""
+    ``light`` [n, 2] has factors on the texture on both sides of the vertices."""
     corners = part.vertices[part.faces].astype(np.float64)
     matrix = camera.intrinsics[0].double().numpy()
     pose = camera.extrinsics[0].double().numpy()
@@ -220,8 +217,7 @@ def photographed(part, camera, samples, light):
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_photograph_follows_its_formulas(samples):
-    """Kernels, and the choice of the rays that are cast,
-    against all rays and all faces in float64."""
+    """Kernels and the selection of rays agree with all rays against all faces in float64."""
     rng = np.random.default_rng(samples)
     sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     vertices = np.float32(sphere.vertices * rng.uniform(0.6, 1.4, (len(sphere.vertices), 1)))
@@ -248,8 +244,7 @@ def test_photograph_follows_its_formulas(samples):
 
 
 def test_lights_are_the_same_for_every_view_and_seam_free():
-    """Light follows its formula on a round body, whose normals are known;
-    UV seams are invisible."""
+    """Light agrees with its formula on a round body with known normals; UV seams are invisible."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     exploded = TexturedMesh(  # every face has its own vertices, as along UV seams
         np.asarray(sphere.triangles, np.float32).reshape(-1, 3),
@@ -275,8 +270,7 @@ def test_lights_are_the_same_for_every_view_and_seam_free():
 
 
 def test_shadows_are_soft():
-    """Below a half-plane under a round light: lit, dark,
-    and between them the share of the disc in sight."""
+    """Below a half-plane under a disc light: lit, dark, and in between the visible fraction of the disc."""
     height = 1.0
     fine = np.linspace(-1, 1, 201)
     across, along = np.meshgrid(fine, [-1.0, 1.0])
@@ -303,7 +297,7 @@ def test_shadows_are_soft():
 
 
 def test_subjects_are_as_bright_as_real_ones():
-    """Around 0.40 of full brightness; white clothes stay brighter than dark ones."""
+    """Mean brightness is about 0.40; white clothes remain brighter than dark ones."""
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     means = {}
     for level in (40, 100, 220):
@@ -316,7 +310,7 @@ def test_subjects_are_as_bright_as_real_ones():
 
 
 def test_both_sides_are_lit_and_winding_does_not_matter():
-    """Scans with flipped faces are lit like others."""
+    """Scans with flipped faces are lit like other scans."""
     lights = Lights(count=(1, 1), ambient=(0.2, 0.2)).draw(np.random.default_rng(0))
     part = quad()
     flipped = TexturedMesh(part.vertices, part.faces[:, ::-1].copy(), part.uv, part.texture)
@@ -326,8 +320,7 @@ def test_both_sides_are_lit_and_winding_does_not_matter():
 
 
 def test_camera_beside_and_inside_the_subject():
-    """An empty view gives empty maps; vertices behind the camera do not make the
-    window too small."""
+    """An empty view yields empty maps; vertices behind the camera do not make the window too small."""
     away = front_camera(16)
     away.intrinsics[:, 0, 2] += 1000
     _, mask, depth = shoot([quad()], away)
@@ -340,7 +333,7 @@ def test_camera_beside_and_inside_the_subject():
 
 @pytest.mark.parametrize("value", [0.0, -5.0, float("nan")])
 def test_bad_focal_length_is_refused(value):
-    """The message names the camera, in place of an empty photograph."""
+    """An error with the camera's number instead of an empty photograph."""
     camera = front_camera(16)
     camera.intrinsics[:, 0, 0] = value
     with pytest.raises(InputError, match="camera 0: expected finite values and focal lengths above 0"):
@@ -348,7 +341,7 @@ def test_bad_focal_length_is_refused(value):
 
 
 def test_ring_has_the_angles_of_the_layout():
-    """Cameras stand where stereo readers of the THuman2.0 layout expect each view."""
+    """Cameras are where stereo readers of the THuman2.0 layout expect each view."""
     rig, rng = Rig(), subject_rng(0, "a")
     yaws = rig.yaws(rng)
     cameras = rig.cameras(yaws, 128, 128)
@@ -373,7 +366,7 @@ def test_ring_has_the_angles_of_the_layout():
 
 
 def test_placing_scales_and_moves_body_and_clothes_alike():
-    """Subjects stand on the ground at the asked height, with the body still inside the clothes."""
+    """Subjects stand on the ground with the requested height, with the body still inside the clothes."""
     box = trimesh.creation.box((0.4, 3.0, 0.2))
     part = mesh_part(box)
     part = TexturedMesh(part.vertices + np.float32([5, 7, -2]), part.faces, part.uv, part.texture)
@@ -388,8 +381,7 @@ def test_placing_scales_and_moves_body_and_clothes_alike():
 
 
 def test_without_embree_only_rendering_is_refused(monkeypatch):
-    """Some machines have no wheel of it: what renders no mesh works there:
-    nothing imports it before."""
+    """Some machines have no wheel for it; it is imported only to render meshes."""
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
     with pytest.raises(InputError, match="expected the package embreex, or photographs that are rendered"):
         Studio(Person("p", (quad(),), None), None)

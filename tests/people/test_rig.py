@@ -1,5 +1,4 @@
-"""Rigs that differ between subjects and cameras: limits, framing,
-nothing changed where nothing varies."""
+"""Rigs that vary between subjects and cameras: limits, framing, and no change without variation."""
 
 import hashlib
 import json
@@ -34,8 +33,7 @@ def drawn(rig, person, aspect=1.0, seed=0):
 @pytest.mark.parametrize("extents", [(0.5, 1.7, 0.3), (1.9, 1.7, 0.3), (0.4, 1.1, 0.3)])
 @pytest.mark.parametrize("aspect", [1.0, 0.7])
 def test_every_camera_of_a_varied_rig_sees_the_whole_subject(extents, aspect):
-    """Adults, children and outstretched arms are in every image,
-    as large as ``fill`` says where they fit."""
+    """Adults, children and outstretched arms are within every image, as large as ``fill`` if they fit."""
     fills, radii, pitches = [], [], []
     for seed in range(8):
         person = VARIED.place(box_person(extents=extents), subject_rng(seed, "box"))
@@ -62,7 +60,7 @@ def test_every_camera_of_a_varied_rig_sees_the_whole_subject(extents, aspect):
 
 
 def test_single_cameras_deviate_within_their_limits():
-    """Pitch, roll and place of a camera against its ring; view 1 is still the next ring camera."""
+    """Pitch, roll and position of a camera relative to its ring; view 1 is still the next ring camera."""
     person = VARIED.place(box_person(), subject_rng(0, "box"))
     rig, cameras, yaws = drawn(VARIED, person)
     even = rig.cameras(yaws, 100, 100)
@@ -81,7 +79,7 @@ def test_single_cameras_deviate_within_their_limits():
 
 
 def test_only_views_between_ring_cameras_stand_higher_or_lower():
-    """Targets are seen from heights that no input has; nothing else of the rig changes."""
+    """Targets are at heights that no input has; nothing else in the rig changes."""
     person = VARIED.place(box_person(), subject_rng(0, "box"))
     higher = replace(VARIED, variation=VARIATION.replace(between_pitch=20))
     pitches = []
@@ -95,8 +93,7 @@ def test_only_views_between_ring_cameras_stand_higher_or_lower():
 
 
 def test_without_variation_nothing_changes():
-    """The ring is the same to the bit, and what this version of the renderer has made
-    keeps its name."""
+    """The ring is the same bit for bit, and caches of this renderer version keep their names."""
     person = box_person()
     rig, cameras, yaws = drawn(Rig(), person)
     assert rig == Rig()
@@ -117,7 +114,7 @@ def test_without_variation_nothing_changes():
 
 
 def test_what_varies_changes_nothing_else(tmp_path):
-    """A rolled camera stands where it stood, before the same person in the same light."""
+    """A rolled camera keeps its position, with the same person in the same light."""
     readers = []
     for name, rig in (("even", RIG), ("rolled", replace(RIG, variation=Variation(camera_roll=20)))):
         render_boxes(tmp_path / name, tmp_path / "scans", train=1, val=1, rig=rig)
@@ -146,13 +143,13 @@ def test_what_varies_changes_nothing_else(tmp_path):
     ],
 )
 def test_impossible_variations_are_refused(values, message):
-    """The message names the key."""
+    """The message contains the key."""
     with pytest.raises(InputError, match=rf"^data\.rig\.variation\W{message}"):
         RigOptions(variation=values)
 
 
 def test_a_ring_inside_the_subject_is_refused():
-    """A camera that has parts of the subject behind it cannot frame it."""
+    """A camera with parts of the subject behind it cannot frame the subject."""
     rig = Rig(height=None, variation=Variation(radius=(0.2, 0.2), fill=(0.5, 0.9)))
     with pytest.raises(InputError, match=r"data\.rig\.radius: expected a ring farther from box"):
         drawn(rig, box_person(extents=(0.8, 1.7, 0.8)))

@@ -1,4 +1,4 @@
-"""Scans on disk: loaded as they are, rendered with one transform, and bad ones are named."""
+"""Scans on disk: loaded unchanged, rendered with one transform, and invalid ones reported."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from tests.helpers.people import render_boxes, write_obj_scan
 
 
 def test_obj_scans_are_loaded_as_they_are(tmp_path):
-    """Vertices, texture and body are those of the files; a lost .mtl does not matter."""
+    """Vertices, texture and body equal those in the files; a missing .mtl does not matter."""
     write_obj_scan(tmp_path, "a", (200, 90, 30))
     person = ScanSource(tmp_path).load("a")
     part = person.parts[0]
@@ -63,7 +63,7 @@ def test_names_of_windows_programs(tmp_path):
 
 
 def test_folders_with_meshes_of_other_names_are_named(tmp_path, caplog):
-    """They were left out without a word; folders without meshes, and hidden ones, are no scans."""
+    """They are reported; folders without meshes and hidden ones are not scans."""
     for name in ("a", "b", "fits", ".c"):
         write_obj_scan(tmp_path, name)
     (tmp_path / "b" / "b.obj").rename(tmp_path / "b" / "scan.FBX")
@@ -74,7 +74,7 @@ def test_folders_with_meshes_of_other_names_are_named(tmp_path, caplog):
 
 
 def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
-    """The image beside the mesh is that of its only material, not of whichever lost its own."""
+    """The image next to the mesh is used for an only material, not for one of several without its own."""
     path = write_obj_scan(tmp_path, "a")
     lines = path.read_text().splitlines()
     second = next(i for i, line in enumerate(lines) if line.startswith("f ")) + 4
@@ -85,8 +85,7 @@ def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
 
 
 def test_glb_scans_keep_parts_and_frames(tmp_path):
-    """Parts keep their transforms; a mesh without texture, or with one that cuts parts away,
-    is refused."""
+    """Parts keep their transforms; a mesh without texture, or with a transparent one, is rejected."""
     scene = trimesh.Scene()
     for k, mode in enumerate(("OPAQUE", "OPAQUE", "MASK")):
         mesh = trimesh.creation.box((0.1, 0.2, 0.3))
@@ -186,7 +185,7 @@ def test_folders_without_scans_are_named(tmp_path, name, line):
 
 
 def test_rendered_scans_share_one_transform(tmp_path):
-    """Depth and body vertices of a rendered scan meet: the body here is the box itself."""
+    """Depth and body vertices of a rendered scan agree; here the body is the box itself."""
     render_boxes(tmp_path / "out", tmp_path / "scans", train=1, val=0)
     layout = Layout(tmp_path / "out", "train")
     body = layout.read_body("s0")

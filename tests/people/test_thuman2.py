@@ -1,5 +1,4 @@
-"""THuman2.0 on miniatures in its true layout:
-one test for each quirk that a loader can get wrong."""
+"""THuman2.0 on miniatures in its original layout, with one test for each pitfall of a loader."""
 
 import shutil
 
@@ -26,7 +25,7 @@ RELEASE = {"name": "release", "training_views": [2, 3, 4]}
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """Renders as the published scripts make them: one person a phase, all 16 x 5 views."""
+    """Renderings as by the published scripts: one person per phase, all 16 x 5 views."""
     return miniature.make(tmp_path_factory.mktemp("thuman2"), COUNT, SIZE, 0)
 
 
@@ -40,7 +39,7 @@ def module(root=None, **changes):
 
 
 def seen_by(view) -> np.ndarray:
-    """The mask of the miniature's person 0000 from the camera that was read."""
+    """Mask of the miniature's person 0000 from the camera that was read."""
     rng = subject_rng(0, "0000")
     scan = scan_of("0000", 0)
     person = Rig().place(Person("0000", (scan.mesh,), None), rng)
@@ -48,8 +47,8 @@ def seen_by(view) -> np.ndarray:
 
 
 def test_published_renders_have_integer_pixel_centres(rendered):
-    """The person seen from the camera that was read covers exactly the mask;
-    half a pixel off it does not."""
+    """The person rendered from the camera that was read covers exactly the mask; half a pixel off, it does
+    not."""
     view = stored(module(rendered), "train").view("0000", 2, 3)
     np.testing.assert_array_equal(seen_by(view), view.mask)
     ignored = stored(module(rendered, pixel_centers="half"), "train").view("0000", 2, 3)
@@ -57,7 +56,7 @@ def test_published_renders_have_integer_pixel_centres(rendered):
 
 
 def test_own_renders_have_half_pixel_centres(raw, tmp_path):
-    """pixel_centers=auto leaves the centres of our own renders alone."""
+    """pixel_centers=auto does not change the centres of our own renderings."""
     render = {"size": 48, "samples": 1, "views": (0, 3), "positions": (0, 1, 2, 3)}
     limit = {"val": 1, "train": 1}
     data = module(str(tmp_path), source=str(raw), limit=limit, render=render, render_workers=0)
@@ -67,8 +66,8 @@ def test_own_renders_have_half_pixel_centres(raw, tmp_path):
 
 
 def test_the_first_camera_faces_the_person(raw):
-    """global_orient of the fit turns the ring:
-    a person that looks elsewhere is still seen from the front."""
+    """global_orient of the fit turns the ring, so that a person with another orientation is seen from the
+    front."""
     source = THuman2Source(raw, find_fits(raw, None))
     for name in ("0000", "0426"):
         scan = scan_of(name, 0)
@@ -129,7 +128,7 @@ def composed(name, root, *overrides):
     ],
 )
 def test_named_protocols(rendered, experiment, size, inputs, targets):
-    """Each experiment= has its publication's size, inputs and targets."""
+    """Each experiment= has the size, inputs and targets of its publication."""
     data, cfg = composed(experiment, rendered)
     assert data.dataset.size == (size, size)
     assert list(cfg.evaluation.targets) == [data.targets.name]

@@ -1,5 +1,4 @@
-"""What task=check says of broken THuman2.0 data: each defect gets one line,
-and training does not start."""
+"""Reports of task=check about broken THuman2.0 data: one line for each defect, and no training."""
 
 import json
 import os
@@ -26,7 +25,7 @@ VIEW = "0000_002/3"
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
-    """Renders with 4 cameras and 2 views each, and the raw scans of the same people."""
+    """Renderings with 4 cameras and 2 views each, and the raw scans of the same people."""
     folder = tmp_path_factory.mktemp("sound")
     count = {"train": 1, "val": 1}
     miniature.make(folder / "root", count, SIZE, 0, vids=(0, 3), positions=4)
@@ -236,7 +235,7 @@ def test_sound_data_is_clean(folder, tmp_path, capsys):
 
 @pytest.mark.parametrize("kind", RENDERED)
 def test_broken_renders(folder, kind):
-    """Each defect of a render is found by task=check and reported once."""
+    """Each defect of a rendering is found by task=check and reported once."""
     damage, pattern = RENDERED[kind]
     damage(folder)
     problems = inspect(module(folder)).problems
@@ -248,7 +247,7 @@ def test_broken_renders(folder, kind):
 
 @pytest.mark.parametrize("kind", RAW)
 def test_broken_scans(folder, kind, monkeypatch):
-    """Each defect of a scan or fit stops its rendering with one line; pickles run nothing."""
+    """Each defect of a scan or fit stops its rendering with one line; code in pickles is not executed."""
     monkeypatch.chdir(folder)
     damage, pattern = RAW[kind]
     damage(folder)
@@ -260,7 +259,7 @@ def test_broken_scans(folder, kind, monkeypatch):
 
 
 def test_an_id_of_a_split_that_is_not_there(folder):
-    """A split that names a missing subject is reported, and stops training."""
+    """A split with a missing subject is reported and stops training."""
     split = {"train": ["0000", "0001"], "val": ["0426"]}
     assert inspect(module(folder, split=split)).problems == [
         f"{folder}/root/train/img/0001_000: expected a whole subject; found none, or a half-rendered one"
@@ -270,7 +269,7 @@ def test_an_id_of_a_split_that_is_not_there(folder):
 
 
 def test_a_folder_of_fits_that_is_not_there(folder):
-    """A wrong data.fits is named instead of being ignored."""
+    """A wrong data.fits is reported instead of being ignored."""
     data = module(folder, source=str(folder / "raw/THuman2.0_Release"), fits=str(folder / "none"))
     with pytest.raises(
         InputError, match=r"none: expected the folder of the SMPL-X fits; found no such folder"
@@ -285,7 +284,7 @@ def test_loading_processes_find_the_same(folder):
 
 
 def test_a_few_vertices_are_no_silhouette(folder):
-    """A body of too few vertices is not mistaken for a wrong camera."""
+    """A body with too few vertices is not mistaken for a wrong camera."""
     body(folder, lambda v: v[:100])
     report = inspect(module(folder))
     assert report.problems == []

@@ -98,7 +98,7 @@ def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
     extrinsics = torch.tensor([camera["extrinsics"] for camera in written])
     cameras = Cameras(own.intrinsics, extrinsics, own.height, own.width)
     assert torch.allclose(up_direction(cameras), torch.tensor([0, 0, 1.0]).double(), atol=1e-5)
-    assert -extrinsics[:, 1, 2].mean() > 0.9  # the images' rows run downwards
+    assert -extrinsics[:, 1, 2].mean() > 0.9  # image rows point downwards
     before = render(prediction.gaussians, batch.cameras, backend="reference").image
     after = render(gaussians, cameras[None], backend="reference").image
     assert torch.allclose(before, after, atol=1e-4)
@@ -249,7 +249,7 @@ def test_gaussians_for_other_viewers_stay_as_they_are():
 def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
     """Also if optical axes meet elsewhere, since the principal point of crops may be anywhere."""
     gaussians, cameras = body(1500, 60), camera_ring(3, 60, 60)
-    # what is photographed is above the point that all cameras look at
+    # the subject is above the point that all cameras look at
     shift = torch.tensor([0.0, 0.7, 0.0])
     gaussians = dataclasses.replace(gaussians, means=gaussians.means + shift)
     intrinsics = cameras.intrinsics.clone()
