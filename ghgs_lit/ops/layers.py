@@ -135,7 +135,7 @@ def room(channels: int) -> int:
 
 
 def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
-    """Weight and bias of each linear layer, in the order that :func:`packed` expects.
+    """Weight and bias of each linear layer, in the order that :func:`pack` expects.
 
     Args:
         layers: such as the modules of an ``nn.Sequential``; all but ``nn.Linear`` are skipped.
@@ -147,7 +147,7 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
     return numbers
 
 
-def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
+def pack(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
     """Pack layers into one flat array.
 
     Args:
@@ -242,7 +242,7 @@ def linear(layers, at, outputs, inputs, values, result):
     """Compute ``result = W values`` of a packed layer, without its biases.
 
     Args:
-        layers: packed layers, from :func:`packed`.
+        layers: packed layers, from :func:`pack`.
         at: offset of the layer.
         outputs: channels of the result.
         inputs: channels of ``values``.
@@ -258,7 +258,7 @@ def rectify(layers, at, outputs, inputs, values):
     """Compute ``values = max(values + b, 0)`` with the biases of a packed layer; NaN stays NaN.
 
     Args:
-        layers: packed layers, from :func:`packed`.
+        layers: packed layers, from :func:`pack`.
         at: offset of the layer.
         outputs: channels of ``values``.
         inputs: channels of the layer's input.

@@ -136,7 +136,7 @@ def attend_to_neighbors(
         q, k, v = (values.unflatten(1, (heads, -1)).transpose(0, 1) for values in (q, k, v))
         index = near[None].expand(heads, -1, -1)
         scores = q * q.shape[-1] ** -0.5 @ k.mT
-        logits = _changed(scores.gather(2, index), factor, bias)
+        logits = _modify_logits(scores.gather(2, index), factor, bias)
         # Without a gradient the weights reuse the memory of the scores.
         weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
         weights = weights.scatter_(2, index, logits.softmax(-1))
@@ -182,9 +182,9 @@ def neighbor_weights(
     """
     products = (q[:, None] * keys).unflatten(-1, (heads, -1)).sum(-1)
     factor, bias = (None if values is None else values[..., None] for values in (factor, bias))
-    return _changed(products * (q.shape[1] // heads) ** -0.5, factor, bias).softmax(1)
+    return _modify_logits(products * (q.shape[1] // heads) ** -0.5, factor, bias).softmax(1)
 
 
-def _changed(logits: Tensor, factor: Tensor | None, bias: Tensor | None) -> Tensor:
+def _modify_logits(logits: Tensor, factor: Tensor | None, bias: Tensor | None) -> Tensor:
     logits = logits if factor is None else logits * factor
     return logits if bias is None else logits + bias

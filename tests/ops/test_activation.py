@@ -122,7 +122,7 @@ def test_a_pixel_that_is_listed_twice_has_the_sum_of_both_gradients():
     assert_as_exact_as_pytorch(make_head(axes="surface", guide=True, color_limit=0.1), raw, *others)
 
 
-def strided(x):
+def make_strided(x):
     """The same values with a stride of 2 along the last axis."""
     return torch.stack((x, torch.zeros_like(x)), -1)[..., 0]
 
@@ -135,7 +135,7 @@ def test_strides_change_nothing_and_what_is_not_finite_no_other(kind):
     raw = dataclasses.replace(raw, color=None)
     with kernels(kind):
         expected = head.activate(raw, batch, points, maps)
-        found = head.activate(*(map_tensors(x, strided) for x in (raw, batch, points, maps)))
+        found = head.activate(*(map_tensors(x, make_strided) for x in (raw, batch, points, maps)))
         broken = raw.scale.clone()
         broken[7] = torch.nan
         other = head.activate(dataclasses.replace(raw, scale=broken), batch, points, maps)

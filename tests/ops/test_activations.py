@@ -139,7 +139,7 @@ def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
     torch.testing.assert_close(angle, between, atol=2e-3, rtol=0)
 
 
-def slanted(slope_x, slope_y, dtype=torch.float64):
+def make_plane(slope_x, slope_y, dtype=torch.float64):
     """Depths of the plane z = 2 + a x + b y in front of a camera at the origin that looks along z."""
     size, fx, fy, skew = 20, 30.0, 36.0, 3.0
     lens = torch.tensor([[fx, skew, size / 2 + 1], [0, fy, size / 2 - 2], [0, 0, 1]], dtype=dtype)
@@ -155,7 +155,7 @@ def slanted(slope_x, slope_y, dtype=torch.float64):
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.0), (1.5, 0.0), (-0.4, 1.0)])
 def test_planes_are_exact_up_to_their_border(a, b):
     """One-sided differences at the border of the image and of the mask are also exact on a plane."""
-    depth, cameras = slanted(a, b)
+    depth, cameras = make_plane(a, b)
     valid = torch.ones_like(depth, dtype=torch.bool)
     valid[..., 7:9, 3:5] = False
     depth[~valid] += 0.01  # near the plane, but in the background
@@ -166,7 +166,7 @@ def test_planes_are_exact_up_to_their_border(a, b):
 
 def test_surfaces_do_not_mix():
     """A depth step of a metre and pixels outside the mask do not affect the normal."""
-    depth, cameras = slanted(0.0, 0.0)
+    depth, cameras = make_plane(0.0, 0.0)
     depth[..., 10:] += 1.0
     depth[..., :3] = 77.0
     valid = torch.ones_like(depth, dtype=torch.bool)

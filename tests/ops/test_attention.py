@@ -30,8 +30,8 @@ def error(found, q, k, v):
 
 
 def limit(q, k, v):
-    """Error budget of summation: a hundred times the effect of rounding the arguments once, and one
-    rounding."""
+    """Error budget of a kernel in ``ghgs stress``: a hundred times the effect of rounding the arguments
+    once, plus one rounding, since PyTorch's error depends on a processor's order of summation."""
     g, eps = torch.Generator().manual_seed(1), torch.finfo(torch.float32).eps
     moved = [x.double() * (1 + eps * torch.randn(x.shape, generator=g).sign()) for x in (q, k, v)]
     return 100 * (eps + error(F.scaled_dot_product_attention(*moved).transpose(1, 2), q, k, v))
@@ -72,7 +72,7 @@ def parts(queries, keys, dtype):
     return q[:, :, :queries], k[:, :, :keys], v[:, :, :keys]
 
 
-def rising(keys):
+def make_scores(keys):
     """Scores that rise or fall by hundreds: the running maximum changes in every block of keys, or only
     in the first."""
     v = scene(1, 1, 5 * KEYS, 32, torch.float32)[2]
@@ -84,7 +84,7 @@ def of_types(of_scores, of_values):
     return q.to(of_scores), k.to(of_scores), v.to(of_values)
 
 
-def apart():
+def strided_channels():
     """The same values with channels that are not contiguous."""
     q, k, v = scene(1, 2, 50, 32, torch.float32)
     return tuple(x.transpose(2, 3).contiguous().transpose(2, 3) for x in (q, k, v))
@@ -96,12 +96,12 @@ INPUTS = {
         for queries, keys in ((5, 300), (300, 7), (1, 1))
         for dtype in DTYPES
     },
-    "rising": rising(lambda slope: slope),
-    "falling": rising(lambda slope: -slope),
-    "waves": rising(lambda slope: slope.sin() * 300),
+    "rising": make_scores(lambda slope: slope),
+    "falling": make_scores(lambda slope: -slope),
+    "waves": make_scores(lambda slope: slope.sin() * 300),
     "values in float32": of_types(torch.bfloat16, torch.float32),
     "values in bfloat16": of_types(torch.float32, torch.bfloat16),
-    "apart": apart(),
+    "apart": strided_channels(),
 }
 
 

@@ -62,7 +62,7 @@ def test_a_prediction_and_its_gradients_with_kernels_are_plain_pytorchs():
     model = make_model("model=recurrent").to(DEVICE)
     batch = make_batch(2, 3, 28, 28)
 
-    def predicted() -> tuple[Gaussians, Tensor]:
+    def predict() -> tuple[Gaussians, Tensor]:
         torch.manual_seed(0)
         model.zero_grad()
         fresh = dataclasses.replace(batch).to(DEVICE)
@@ -74,9 +74,9 @@ def test_a_prediction_and_its_gradients_with_kernels_are_plain_pytorchs():
 
     # Independent of settings left by other tests: TF32 would change the results.
     with exact(DEVICE.type), mock.patch.object(dispatch, "DEVICES", set()):
-        expected, slopes = predicted()
+        expected, slopes = predict()
     with exact(DEVICE.type), kernels() as called:
-        found, found_slopes = predicted()
+        found, found_slopes = predict()
     # gsplat lists the splats, and in float32 the memory of rounds is computed by plain PyTorch.
     assert set(called) == NAMES - {"boxed", "placed", "remember"}
     close(found, expected, 1e-4)

@@ -17,7 +17,7 @@ SCENES = {
 }
 
 
-def spoiled(batch: Batch) -> Batch:
+def spoil(batch: Batch) -> Batch:
     """Views with an empty mask, a full mask and a mask of a single pixel."""
     masks = batch.masks.clone()
     masks[0, 0] = False
@@ -28,7 +28,7 @@ def spoiled(batch: Batch) -> Batch:
     return dataclasses.replace(batch, masks=masks)
 
 
-@pytest.mark.parametrize("change", [lambda batch: batch, spoiled], ids=["clean", "spoiled"])
+@pytest.mark.parametrize("change", [lambda batch: batch, spoil], ids=["clean", "spoiled"])
 @pytest.mark.parametrize("tolerance", [0, 1])
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_kernel_gives_the_bounds_of_plain_pytorch(monkeypatch, scene, tolerance, change):

@@ -8,7 +8,7 @@ from torch import nn
 from ghgs_lit.geometry.precision import _float32
 from ghgs_lit.ops import pool
 from ghgs_lit.ops.dispatch import OPERATORS
-from ghgs_lit.ops.round_memory import remembered
+from ghgs_lit.ops.round_memory import update_memory
 from tests.helpers.kernels import DEVICE, WHERE, kernels
 
 #: Gaussians, views, channels of a view, width of the memory, and number of additional inputs.
@@ -33,7 +33,7 @@ def scene(count, views, channels, hidden, known):
 @torch.no_grad()
 def by_kernel(kind, layers, rows):
     with kernels(kind) as called, _float32(WHERE[kind].type, True):
-        found = remembered(layers.to(WHERE[kind]), *(x.to(WHERE[kind]) for x in rows))
+        found = update_memory(layers.to(WHERE[kind]), *(x.to(WHERE[kind]) for x in rows))
     assert called == ["remember"]
     return found.cpu()
 
@@ -44,7 +44,7 @@ def by_kernel(kind, layers, rows):
 def test_the_kernel_remembers_what_plain_pytorch_does(kind, size):
     """The tolerance follows from rounding to TF32 on a GPU, and to float32 elsewhere."""
     layers, rows = scene(*size)
-    expected = remembered(layers.double(), *(x.double() for x in rows))
+    expected = update_memory(layers.double(), *(x.double() for x in rows))
     found = by_kernel(kind, layers.float(), rows)
     limit = {"cpu": 1e-6, "cuda": 2e-3 if DEVICE.type == "cuda" else 5e-6}[kind]
     assert expected.std() > 0.1
@@ -62,7 +62,7 @@ def test_gradients_are_those_of_plain_pytorch(size):
     def gradients(dtype):
         layers.to(dtype)
         each, known, before = (x.to(dtype) for x in rows)
-        after = remembered(layers, each, known, before.requires_grad_())
+        after = update_memory(layers, each, known, before.requires_grad_())
         return torch.autograd.grad((after * weights.to(dtype)).sum(), [before, *layers.parameters()])
 
     with kernels("cpu") as called:

@@ -10,50 +10,50 @@ from ghgs_lit.method.rounds.observation import observe
 from ghgs_lit.ops.attention import cpu as attention
 from ghgs_lit.ops.attention.cpu import QUERIES
 from ghgs_lit.ops.photo_consistency import photo_consistency
-from ghgs_lit.ops.round_memory import remembered
+from ghgs_lit.ops.round_memory import update_memory
 from tests.helpers.scenes import make_batch, surface_splats
 from tests.method.heads.test_gaussian import make_head
 from tests.ops import test_activation, test_attention, test_round_memory
 
 
 @torch.no_grad()
-def activated():
+def run_activation():
     gaussians = make_head(axes="surface").activate(*test_activation.scene(2, 4, 56, 56))
     return [getattr(gaussians, name) for name in test_activation.FIELDS]
 
 
-def attended(heads, tokens, dtype):
+def run_attention(heads, tokens, dtype):
     return [attention.attend_heads(*test_attention.scene(2, heads, tokens, 32, dtype))]
 
 
-def marched():
+def run_march():
     return list(dataclasses.astuple(VisualHull()(make_batch(2, 4, 112, 112))))
 
 
-def observed():
+def run_observation():
     batch = make_batch(2, 4, 112, 112)
     return [observe(surface_splats(batch), batch)]
 
 
-def remembered_and_learned():
+def run_memory():
     layers, rows = test_round_memory.scene(5000, 4, 11, 48, 13)
-    after = remembered(layers, *rows)
+    after = update_memory(layers, *rows)
     return [after, *torch.autograd.grad(after.square().sum(), list(layers.parameters()))]
 
 
-def swept():
+def run_sweep():
     batch = make_batch(2, 4, 112, 112)
     return [photo_consistency(batch, VisualHull()(batch), 4)]
 
 
 CALLS = {
-    "activation": activated,
-    "many heads": lambda: attended(5, 40, torch.float32),
-    "one head": lambda: attended(1, 7 * QUERIES + 3, torch.bfloat16),
-    "march": marched,
-    "memory": remembered_and_learned,
-    "observation": observed,
-    "sweep": swept,
+    "activation": run_activation,
+    "many heads": lambda: run_attention(5, 40, torch.float32),
+    "one head": lambda: run_attention(1, 7 * QUERIES + 3, torch.bfloat16),
+    "march": run_march,
+    "memory": run_memory,
+    "observation": run_observation,
+    "sweep": run_sweep,
 }
 
 

@@ -25,8 +25,8 @@ from ghgs_lit.method.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.method.plan.rows import Rows
 from ghgs_lit.ops.activation import (
-    activated,
     footprint_gaussians,
+    make_gaussians,
 )
 from ghgs_lit.ops.linear import Linear
 from ghgs_lit.ops.photo_consistency import photo_consistency
@@ -187,7 +187,7 @@ class GaussianHead(nn.Module):
         given = (numbers, raw.image, raw.pixel, depth_maps, points.pixels, photo, share, batch.cameras)
         on_surface = options.axes == "surface"
         if not isinstance(self.attributes, FootprintAttributes):
-            fields = activated(*given, self.attributes, options.color_limit, on_surface)
+            fields = make_gaussians(*given, self.attributes, options.color_limit, on_surface)
         else:
             constants = self.attributes.constants(options.offset_limit, options.color_limit)
             fields = footprint_gaussians(*given, constants, on_surface)

@@ -30,7 +30,7 @@ from ghgs_lit.ops.activation import bounded_tanh
 from ghgs_lit.ops.linear import Linear
 from ghgs_lit.ops.observation import CHANNELS
 from ghgs_lit.ops.photo_consistency import consistency_of
-from ghgs_lit.ops.round_memory import remembered
+from ghgs_lit.ops.round_memory import update_memory
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction, Tokens
 
 #: Largest distance from the current depth that the first round tests, as a fraction of far - near.
@@ -270,7 +270,7 @@ class Rounds(nn.Module):
         each = observe(gaussians, batch, drawn)
         matches, place, down, up = self._search(state, batch, rays, size * REACH)
         known = torch.cat((matches, place, gaussians.colors, *steep), -1)
-        memory = remembered(self._layers, each, known, memory)
+        memory = update_memory(self._layers, each, known, memory)
         memory = memory if windows is None else self.exchange(memory, windows)
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
@@ -279,7 +279,7 @@ class Rounds(nn.Module):
 
     @property
     def _layers(self) -> tuple[nn.Linear, ...]:
-        """Weights for :func:`ghgs_lit.ops.round_memory.remembered`."""
+        """Weights for :func:`ghgs_lit.ops.round_memory.update_memory`."""
         return self.view[0], self.view[2], self.update[0], self.update[2], self.memory
 
     @torch.no_grad()

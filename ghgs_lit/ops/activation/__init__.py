@@ -179,7 +179,7 @@ def surface_axes(
     return multiply_quaternions(matrix_to_quaternion(extrinsics[:, :3, :3].mT)[image], turn)
 
 
-def activated(
+def make_gaussians(
     raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
     image: Int[Tensor, " N"],
     pixel: Int[Tensor, " N"],
@@ -243,7 +243,7 @@ def footprint_gaussians(
     constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Make Gaussians from raw attributes with :func:`footprint_attributes`; see :func:`activated`.
+    """Make Gaussians from raw attributes with :func:`footprint_attributes`; see :func:`make_gaussians`.
 
     Differentiable with respect to all inputs but cameras and depths.
 
@@ -287,7 +287,7 @@ def _plain(*inputs: Any) -> tuple[Tensor, ...]:
     constants = Constants(*constants)
     attributes = partial(footprint_attributes, constants=constants)
     given = (raw, image, pixel, maps, points, photo, share, cameras)
-    return activated(*given, attributes, constants.color_limit, on_surface)
+    return make_gaussians(*given, attributes, constants.color_limit, on_surface)
 
 
 def _plain_back(*inputs: Any) -> list[Tensor]:

@@ -20,7 +20,7 @@ _LARGE = 1 << 27
 _FEATURES = {"avx2", "fma"}
 
 
-def _attended(q: Tensor, k: Tensor, v: Tensor, keys: Tensor | None) -> Tensor:
+def _attend(q: Tensor, k: Tensor, v: Tensor, keys: Tensor | None) -> Tensor:
     """``softmax(q k^T / sqrt(d)) v`` of every head, heads concatenated.
 
     Args:
@@ -48,7 +48,7 @@ def _fits_cpu(q: Tensor, k: Tensor, v: Tensor, keys: Tensor | None) -> bool:
 
 attend = Operator(
     "attend(Tensor q, Tensor k, Tensor v, Tensor? keys) -> Tensor",
-    _attended,
+    _attend,
     __name__,
     {"cpu": _fits_cpu},
     dtypes=(torch.float32, torch.bfloat16),

@@ -43,8 +43,8 @@ def attend_head(q, k, v, out, first, last):
     """
     tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
-    keys = _packed_keys(k)
-    values = _packed_values(v)
+    keys = _pack_keys(k)
+    values = _pack_values(v)
     queries = simd.aligned(QUERIES * width)
     scores = simd.aligned(ROWS * KEYS)
     weights = simd.aligned(ROWS * KEYS)
@@ -74,15 +74,15 @@ def attend_head(q, k, v, out, first, last):
 
 
 @helper
-def _padded(count):
+def _round_up(count):
     return -(-count // PANEL) * PANEL
 
 
 @helper
-def _packed_keys(k):
+def _pack_keys(k):
     """Pack keys into panels [channels, PANEL]; the last panel is padded with zeros."""
     tokens, steps = k.shape
-    packed = simd.aligned(_padded(tokens) * steps)
+    packed = simd.aligned(_round_up(tokens) * steps)
     for panel in range(0, tokens, PANEL):
         count = min(PANEL, tokens - panel)
         for t in range(steps):
@@ -95,10 +95,10 @@ def _packed_keys(k):
 
 
 @helper
-def _packed_values(v):
+def _pack_values(v):
     """Pack values into panels [tokens, PANEL] of ``PANEL`` channels; tokens are padded with zeros."""
     tokens, width = v.shape
-    lines = _padded(tokens)
+    lines = _round_up(tokens)
     packed = simd.aligned(lines * width)
     for panel in range(0, width, PANEL):
         for line in range(lines):
@@ -127,7 +127,7 @@ def _score(queries, row, keys, key, seen, steps, scores):
     for panel in range(0, seen, PANEL):
         product(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
     for r in range(ROWS):
-        for i in range(seen, _padded(seen)):
+        for i in range(seen, _round_up(seen)):
             scores[r * KEYS + i] = LOWEST
 
 
@@ -168,7 +168,7 @@ def _weigh(scores, r, seen, scale, top, weights, sums, query):
     total = memory.load(sums, query * LANES)
     minus = simd.full(-scale)
     limit = simd.full(EXP2_LIMIT)
-    for i in range(0, _padded(seen), LANES):
+    for i in range(0, _round_up(seen), LANES):
         depth = simd.fma(memory.load(scores, r * KEYS + i), minus, top)
         # ``minimum`` returns the second argument where either is NaN, so NaN stays NaN.
         weight = simd.exp2_minus(simd.minimum(limit, depth))
@@ -184,7 +184,7 @@ def _add_values(weights, values, key, seen, totals, row, width):
     lines = len(values) // width
     for panel in range(0, width, PANEL):
         at = row * width + panel
-        add_values(weights, 0, values, panel * lines + key * PANEL, _padded(seen), totals, at, width)
+        add_values(weights, 0, values, panel * lines + key * PANEL, _round_up(seen), totals, at, width)
 
 
 @helper

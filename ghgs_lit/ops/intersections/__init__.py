@@ -67,7 +67,7 @@ def intersections(
     shape = depths.shape[:-1]
     rows = -(-height // TILE)
     columns = -(-width // TILE)
-    fixed = _fixed(shape, rows, columns, centers.device)
+    fixed = _tile_constants(shape, rows, columns, centers.device)
     centers = centers.reshape(-1, depths.shape[-1], 2)
     radii = radii.reshape(centers.shape)
     _, order = depths.contiguous().view(torch.int32).flatten().sort(stable=True)
@@ -80,7 +80,7 @@ def intersections(
     return Intersections(splat[order], offsets, fixed.has_pixels, ends[-1])
 
 
-def _boxed(
+def _find_tiles(
     centers: Float[Tensor, "I N 2"],
     radii: Int[Tensor, "I N 2"],
     order: Int[Tensor, " I*N"],
@@ -116,7 +116,7 @@ def _sizes(columns: int, rows: int, **kind: object) -> Tensor:
     return torch.tensor((columns, rows), **kind)
 
 
-def _placed(
+def _list_intersections(
     ends: Int[Tensor, " N"],
     boxes: Int32[Tensor, "3 N"],
     order: Int[Tensor, " N"],
@@ -128,7 +128,7 @@ def _placed(
 
     Args:
         ends: end of each splat's intersections, the cumulative number of tiles.
-        boxes: from :func:`_boxed`.
+        boxes: from :func:`_find_tiles`.
         order: indices of the splats in ``ends`` and ``boxes``.
         every: indices of all tiles; unused entries get the last one.
         capacity: number of entries.
@@ -150,14 +150,14 @@ def _placed(
 
 _BOXED = Operator(
     "boxed(Tensor centers, Tensor radii, Tensor order, int rows, int columns) -> Tensor",
-    _boxed,
+    _find_tiles,
     __name__,
     {"cuda": everything},
 )
 _PLACED = Operator(
     "placed(Tensor ends, Tensor boxes, Tensor order, Tensor every, int capacity, int columns) "
     "-> (Tensor, Tensor)",
-    _placed,
+    _list_intersections,
     __name__,
     {"cuda": everything},
 )
@@ -179,7 +179,7 @@ class _Fixed(NamedTuple):
 @cache
 # the first call may be in a validation, but training steps save these tensors for the backward pass
 @torch.inference_mode(False)
-def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:
+def _tile_constants(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:
     """Constants of :func:`intersections` for a batch shape ``images`` with ``rows`` x ``columns`` tiles
     each, cached per device."""
     count = images.numel() * (rows + 1) * columns

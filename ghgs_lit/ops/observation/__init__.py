@@ -18,7 +18,7 @@ from ghgs_lit.types import Cameras
 CHANNELS = 11
 
 
-def _compared(
+def _observe(
     means: Float[Tensor, "N 3"],
     colors: Float[Tensor, "N 3"],
     image: Int[Tensor, " N"],
@@ -65,7 +65,7 @@ def _compared(
 observations = Operator(
     "observe(Tensor means, Tensor colors, Tensor image, Tensor intrinsics, Tensor extrinsics, Tensor photo, "
     "Tensor mask, Tensor drawn, Tensor alpha, Tensor depth, float scale, int[] splits) -> Tensor",
-    _compared,
+    _observe,
     __name__,
     {"cpu": everything, "cuda": everything},
 )

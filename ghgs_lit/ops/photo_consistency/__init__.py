@@ -71,7 +71,7 @@ def consistency_of(
         return _sweep(pixels, near, far, colors, *views, *batch.masks.shape[2:], steps, TOLERANCE)
 
 
-def _swept(
+def _sweep_depths(
     pixels: Int[Tensor, " N"],
     near: Float[Tensor, " N"],
     far: Float[Tensor, " N"],
@@ -90,7 +90,7 @@ def _swept(
         pixels: indices among the pixels of all images.
         near: smallest depths, in the unit of the cameras.
         far: largest depths, in the unit of the cameras.
-        colors: smoothed images and their masks, from :func:`_smoothed`.
+        colors: smoothed images and their masks, from :func:`_smooth_colors`.
         turn: matrices from pixels of a view (second axis) to another (third axis); see
             :func:`_relations`.
         shift: added in the other view; see :func:`_relations`.
@@ -127,7 +127,7 @@ def _best_match(
     tolerance: float,
 ) -> Float[Tensor, "n S"]:
     """Agreement [n, S] in [0, 1] of pixels at their depths with the best other view; arguments as in
-    :func:`_swept`."""
+    :func:`_sweep_depths`."""
     views, _, height, width = colors.shape[1:]
     image = pixels // (height * width)
     place = pixels % (height * width)
@@ -179,10 +179,10 @@ def _smooth(batch: Batch) -> Tensor:
 
 
 def _smooth_plainly(batch: Batch) -> Tensor:
-    return _smoothed(batch.once(surface_colors), batch.masks)
+    return _smooth_colors(batch.once(surface_colors), batch.masks)
 
 
-def _smoothed(
+def _smooth_colors(
     images: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 4 H W"]:
     """Mean colours of the foreground pixels in 3 x 3 windows, and the mask as a fourth channel,
@@ -230,12 +230,12 @@ def _relations(
 
 #: On a CPU, the colours are one flat array, the layout of the CPU kernel of :data:`_sweep`.
 _smoothing = Operator(
-    "smoothed(Tensor images, Tensor masks) -> Tensor", _smoothed, __name__, {"cpu": everything}
+    "smoothed(Tensor images, Tensor masks) -> Tensor", _smooth_colors, __name__, {"cpu": everything}
 )
 _sweep = Operator(
     "swept(Tensor pixels, Tensor near, Tensor far, Tensor colors, Tensor turn, Tensor shift, "
     "Tensor compared, int height, int width, int steps, float tolerance) -> Tensor",
-    _swept,
+    _sweep_depths,
     __name__,
     {"cpu": lambda pixels, near, far, colors, *others: colors.dim() == 1, "cuda": everything},
 )

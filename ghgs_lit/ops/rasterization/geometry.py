@@ -51,7 +51,7 @@ def rotation(w, x, y, z):
 
 
 @helper
-def scaled(r, s):
+def scale_columns(r, s):
     """``R S``: the columns of the 3 x 3 matrix ``r`` times the three scales ``s``."""
     return (
         r[0] * s[0], r[1] * s[1], r[2] * s[2], r[3] * s[0], r[4] * s[1], r[5] * s[2],
@@ -86,7 +86,7 @@ def camera_points(view, mean):
 
 
 @helper
-def clamped(view, x, y):
+def clamp_to_frame(view, x, y):
     """Clamp x / z and y / z to the frame and its margin, for the Jacobian."""
     x = simd.minimum(simd.maximum(x, view[layout.X_LOW]), view[layout.X_HIGH])
     y = simd.minimum(simd.maximum(y, view[layout.Y_LOW]), view[layout.Y_HIGH])
@@ -99,8 +99,8 @@ def affine(view, x, y, inverse):
 
     Args:
         view: a camera, [VIEW].
-        x: x / z, from :func:`clamped`.
-        y: y / z, from :func:`clamped`.
+        x: x / z, from :func:`clamp_to_frame`.
+        y: y / z, from :func:`clamp_to_frame`.
         inverse: 1 / z.
     """
     fx = view[layout.FX] * inverse

@@ -155,7 +155,7 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
         sums: accumulated, rows of 8 doubles: gradients of the mean, of ``R S`` and of the opacity.
     """
     x, y, _, inverse = geometry.camera_points(view, mean)
-    clamped_x, clamped_y = geometry.clamped(view, x, y)
+    clamped_x, clamped_y = geometry.clamp_to_frame(view, x, y)
     t = geometry.affine(view, clamped_x, clamped_y, inverse)
     d_m, d_opacity = _footprint_gradient(moments, record, geometry.footprint(t, root), low_pass, antialiased)
     _add(sums, _OPACITY, drawn, d_opacity)
@@ -250,7 +250,7 @@ def collect(
         scale = tables.columns3(scales, n, last)
         w, x, y, z, inverse = geometry.unit(tables.columns4(quaternions, n, last))
         rotation = geometry.rotation(w, x, y, z)
-        root = geometry.scaled(rotation, scale)
+        root = geometry.scale_columns(rotation, scale)
         sums[:] = 0.0
         for i in range(n, min(n + _WIDE, last)):
             for c in range(channels):
@@ -277,7 +277,7 @@ def collect(
             geometry.dot(r[1], r[4], r[7], d[1], d[4], d[7]),
             geometry.dot(r[2], r[5], r[8], d[2], d[5], d[8]),
         ))  # fmt: skip
-        d_quaternion = _quaternion_gradient(w, x, y, z, inverse, geometry.scaled(d, scale))
+        d_quaternion = _quaternion_gradient(w, x, y, z, inverse, geometry.scale_columns(d, scale))
         tables.store_columns4(d_quaternions, n, last, d_quaternion)
         tables.store_columns3(
             d_means, n, last, (memory.load(sums, 0), memory.load(sums, _WIDE), memory.load(sums, 2 * _WIDE))

@@ -64,7 +64,7 @@ def _project_vector(
         Bit mask of the visible splats.
     """
     x, y, z, inverse = geometry.camera_points(view, mean)
-    clamped_x, clamped_y = geometry.clamped(view, x, y)
+    clamped_x, clamped_y = geometry.clamp_to_frame(view, x, y)
     footprint = geometry.footprint(geometry.affine(view, clamped_x, clamped_y, inverse), root)
     bare, determinant, xx, yy = geometry.determinants(footprint, geometry.normal(footprint), low_pass)
     a = xx + low_pass
@@ -141,7 +141,7 @@ def project(
         scale = tables.columns3(scales, n, last)
         opacity = tables.columns1(opacities, n, last)
         w, x, y, z, _ = geometry.unit(quaternion)
-        root = geometry.scaled(geometry.rotation(w, x, y, z), scale)
+        root = geometry.scale_columns(geometry.rotation(w, x, y, z), scale)
         for t in range(len(views)):
             m = n + shifts[t]
             seen = _project_vector(

@@ -123,7 +123,7 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
     return pointer_to(context, builder, array_type, args[0], position, types.intp, kind)
 
 
-def _masked(builder, name: str, kind, rows, count: int, *args):
+def _access_rows(builder, name: str, kind, rows, count: int, *args):
     """Load or store the first rows of a vector of eight rows of ``count`` floats.
 
     Args:
@@ -171,7 +171,7 @@ def _make_columns(count: int):
 
         def emit(context, builder, sig, args):
             address = _flat_rows(context, builder, array, args, row, count, kind)
-            lines = _masked(builder, "load", kind, builder.sub(args[2], args[1]), count, address)
+            lines = _access_rows(builder, "load", kind, builder.sub(args[2], args[1]), count, address)
             values = []
             for k in range(count):
                 column = builder.shuffle_vector(lines, lines, indices(range(k, DOUBLES * count, count)))
@@ -196,7 +196,7 @@ def _make_columns(count: int):
             columns = cgutils.unpack_tuple(builder, args[3], count)
             lines = _interleave(builder, [builder.fptrunc(column, _FLOAT8) for column in columns])
             address = _flat_rows(context, builder, array, args, row, count, kind)
-            _masked(builder, "store", kind, builder.sub(args[2], args[1]), count, lines, address)
+            _access_rows(builder, "store", kind, builder.sub(args[2], args[1]), count, lines, address)
             return context.get_dummy_value()
 
         return types.void(array, types.int64, types.int64, types.UniTuple(doubles, count)), emit

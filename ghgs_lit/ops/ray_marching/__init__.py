@@ -44,7 +44,7 @@ def look_up(
     return tables.flatten().take(torch.add(place, image, alpha=height * width))
 
 
-def _marched(
+def _march(
     masks: Bool[Tensor, "B V h w"],
     outside: UInt8[Tensor, "B V h w"],
     matrices: Float[Tensor, "B V 3 4"],
@@ -112,7 +112,7 @@ def _marched(
 march = Operator(
     "march(Tensor masks, Tensor outside, Tensor matrices, Tensor directions, Tensor centers, Tensor near,"
     " Tensor far, Tensor steps, int tolerance, Tensor? rays, int? count) -> (Tensor, Tensor)",
-    _marched,
+    _march,
     __name__,
     {"cpu": everything},
 )

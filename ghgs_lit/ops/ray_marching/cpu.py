@@ -40,14 +40,14 @@ def _vote(table, x, y, w):
 
 
 @helper
-def _fused(start, length, slope):
+def _multiply_add(start, length, slope):
     """``start + length * slope`` of float32 numbers, rounded once like ``torch.addcmul`` on processors with
     fused multiply-add."""
     return np.float32(np.float64(start) + np.float64(length) * np.float64(slope))
 
 
 @helper
-def _allowed(outside, element, view, origin, along, depth, tolerance):
+def _is_allowed(outside, element, view, origin, along, depth, tolerance):
     """Whether at most ``tolerance`` other views vote "outside" for a point of a ray.
 
     Args:
@@ -62,9 +62,9 @@ def _allowed(outside, element, view, origin, along, depth, tolerance):
     votes = 0
     for u in range(len(origin)):
         if u != view:
-            x = _fused(origin[u, 0], depth, along[u, 0])
-            y = _fused(origin[u, 1], depth, along[u, 1])
-            w = _fused(origin[u, 2], depth, along[u, 2])
+            x = _multiply_add(origin[u, 0], depth, along[u, 0])
+            y = _multiply_add(origin[u, 1], depth, along[u, 1])
+            w = _multiply_add(origin[u, 2], depth, along[u, 2])
             votes += _vote(outside[element, u], x, y, w)
             if votes > tolerance:
                 return False
@@ -119,7 +119,7 @@ def march_rows(
             entry = 0
             while entry < samples:
                 depth = begin + steps[entry] * length
-                if _allowed(outside, element, view, origin, along, depth, tolerance):
+                if _is_allowed(outside, element, view, origin, along, depth, tolerance):
                     break
                 entry += 1
             if entry == samples:
@@ -127,7 +127,7 @@ def march_rows(
             end = samples - 1
             while end > entry:
                 depth = begin + steps[end] * length
-                if _allowed(outside, element, view, origin, along, depth, tolerance):
+                if _is_allowed(outside, element, view, origin, along, depth, tolerance):
                     break
                 end -= 1
             near[element, view, row, column] = begin + steps[entry] * length - half

@@ -20,7 +20,7 @@ from ghgs_lit.ops.pool import at_once, even_parts, multiplies
 _AT_ONCE = 2048
 
 
-def remembered(
+def update_memory(
     layers: Sequence[nn.Linear],
     each: Float[Tensor, "N V c"],
     known: Float[Tensor, "N k"],
@@ -52,10 +52,10 @@ def plain(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[Tensor]
     count = len(each)
     most = count if torch.is_grad_enabled() else at_once(each.device, _AT_ONCE, count)
     parts = even_parts(count, most)
-    return torch.cat([_remembered(each[part], known[part], memory[part], weights) for part in parts])
+    return torch.cat([_update(each[part], known[part], memory[part], weights) for part in parts])
 
 
-def _remembered(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[Tensor]) -> Tensor:
+def _update(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[Tensor]) -> Tensor:
     own, others = _two_layers(each, weights[:4]).split((1, each.shape[1] - 1), 1)
     inputs = torch.cat((own[:, 0], others.mean(1), others.amax(1), known, memory), -1)
     return torch.tanh(memory + F.linear(_two_layers(inputs, weights[4:8]), *weights[8:]))

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ghgs_lit.ops import memory, pool, simd
 from ghgs_lit.ops.compile import FLOATS, NUMBER, helper, kernel_for
-from ghgs_lit.ops.layers import PANEL, linear, lines, packed, put_rows, rectify, size
+from ghgs_lit.ops.layers import PANEL, linear, lines, pack, put_rows, rectify, size
 from ghgs_lit.ops.simd import LANES
 
 ZERO = np.float32(0)
@@ -47,7 +47,7 @@ def remember_rows(each, known, before, layers, after, first, last):
         each: observations in each view, the own view first [N, V, c].
         known: additional inputs of each Gaussian [N, k].
         before: memory of the previous rounds [N, h].
-        layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
+        layers: packed layers, from :func:`ghgs_lit.ops.layers.pack`.
         after: written in these rows [N, h].
         first: first row.
         last: end of the rows, excluded.
@@ -99,6 +99,6 @@ def remember(each: Tensor, known: Tensor, before: Tensor, weights: list[Tensor])
     """Kernel of the operator of :mod:`ghgs_lit.ops.round_memory`; see its ``plain``."""
     after = torch.empty_like(before, memory_format=torch.contiguous_format)
     rows = [x.detach().contiguous().numpy() for x in (each, known, before)]
-    given = (*rows, packed(weights), after.numpy())
+    given = (*rows, pack(weights), after.numpy())
     pool.run_rows(remember_rows(), given, [(0, len(before))], _TASK, WORK * len(before))
     return after

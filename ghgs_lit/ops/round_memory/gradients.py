@@ -16,7 +16,7 @@ from ghgs_lit.ops.layers import (
     learn,
     linear,
     lines,
-    packed,
+    pack,
     put_ones,
     put_rows,
     put_slopes,
@@ -57,7 +57,7 @@ def _unsee(view, hidden, views, shown, seen, slopes, own):
 
 
 @helper
-def _of(view, views, buffer):
+def _view_part(view, views, buffer):
     """The part of a buffer that belongs to a view."""
     each = len(buffer) // views
     return buffer[view * each : (view + 1) * each]
@@ -81,7 +81,7 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
         each: observations in each view, the own view first [N, V, c].
         known: additional inputs of each Gaussian [N, k].
         before: memory of the previous rounds [N, h].
-        layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
+        layers: packed layers, from :func:`ghgs_lit.ops.layers.pack`.
         places: [layers + 1, 3]; see :class:`ghgs_lit.ops.layers.Sums`.
         start: first row.
         count: number of rows.
@@ -98,9 +98,9 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
     inputs = 4 * hidden + known.shape[1]
     wide = 2 * hidden
     for view in range(views):
-        x = _of(view, views, given)
-        a = _of(view, views, one)
-        b = _of(view, views, two)
+        x = _view_part(view, views, given)
+        a = _view_part(view, views, one)
+        b = _view_part(view, views, two)
         put_rows(each[:, view], start, count, 0, x)
         put_ones(channels, x)
         _layer(layers, places[0, 0], hidden, channels, x, a)
@@ -126,7 +126,7 @@ def remember_back(
         before: memory of the previous rounds [N, h].
         after: the new memory [N, h].
         slopes: gradients of ``after`` [N, h].
-        layers: packed layers, from :func:`ghgs_lit.ops.layers.packed`.
+        layers: packed layers, from :func:`ghgs_lit.ops.layers.pack`.
         backs: the packed transposed layers.
         places: [layers + 1, 3]; see :class:`ghgs_lit.ops.layers.Sums`.
         sums: accumulated, gradients of the layers in one task.
@@ -173,9 +173,9 @@ def remember_back(
             for channel in range(hidden):
                 d_before[start + lane, channel] += slope[(inputs - hidden + channel) * PANEL + lane]
         for view in range(views):
-            x = _of(view, views, given)
-            a = _of(view, views, one)
-            b = _of(view, views, two)
+            x = _view_part(view, views, given)
+            a = _view_part(view, views, one)
+            b = _view_part(view, views, two)
             _unsee(view, hidden, views, b, seen, slope, down)
             unrectify(b, hidden, down)
             learn(a, hidden, down, hidden, turned, places[1, 2], sums)
@@ -202,7 +202,7 @@ def gradients(
     sums = Sums(weights, len(parts))
     d_before = torch.empty_like(slopes, memory_format=torch.contiguous_format)
     arrays = [x.detach().contiguous().numpy() for x in (*rows, slopes)]
-    layers = packed(weights), packed(weights, transposed=True), sums.places
+    layers = pack(weights), pack(weights, transposed=True), sums.places
     tasks = [
         partial(remember_back(), *arrays, *layers, own, d_before.numpy(), part.start, part.stop)
         for own, part in zip(sums.of_task, parts, strict=True)
