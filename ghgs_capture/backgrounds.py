@@ -106,7 +106,7 @@ class Background:
         """Segment a photograph again.
 
         Args:
-            photograph: of this camera, of the background's size.
+            photograph: photograph by this camera, with the background's size.
             inside: [h, w] distance in pixels of each pixel inside the hull of the other masks; None
                 without other masks.
             most: as ``inside``, for the hull in which one of the other masks may be missed.

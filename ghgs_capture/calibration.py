@@ -40,7 +40,7 @@ class Convention:
 
     Attributes:
         extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
-        axes: of the camera: ``opencv`` (y down, z forward) | ``opengl`` (y up, z backward).
+        axes: axes of the camera: ``opencv`` (y down, z forward) | ``opengl`` (y up, z backward).
         intrinsics: ``pixels``, or shares of width and height: ``normalized`` (all) |
             ``normalized_principal`` (the principal point alone).
         pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0
@@ -194,7 +194,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     Intrinsics for another size of the same aspect ratio are scaled.
 
     Args:
-        camera: as its file stores it.
+        camera: the camera as stored in its file.
         convention: meaning of its numbers.
         photograph: (height, width) of the photograph in pixels.
 

@@ -203,7 +203,7 @@ def find_copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
     """Find two photographs that are copies of one picture, even if stored with losses.
 
     Args:
-        photographs: of one instant, with their mattes.
+        photographs: photographs of one instant, with their mattes.
 
     Returns:
         Their names; None without copies.

@@ -43,7 +43,7 @@ def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
 
     Args:
         phase: folder of the phase, or a workspace.
-        name: of the subject.
+        name: name of the subject.
         vertices: [n, 3], metres.
     """
     folder = phase / "smpl" / name

@@ -36,7 +36,7 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
     previous Gaussian, which is usually a neighbour.
 
     Args:
-        gaussians: of one subject, with RGB colours.
+        gaussians: Gaussians of one subject, with RGB colours.
         pixel: side of a photograph's pixel at the subject, in the unit of the cameras.
         center: point [3] in the middle of the subject.
         steps: ``FINE`` or ``COARSE``.

@@ -44,7 +44,7 @@ def half_turned(gaussians: Gaussians) -> Gaussians:
     https://github.com/nianticlabs/spz, "Coordinate System"; gaussforge does not convert axes.
 
     Args:
-        gaussians: of any number of subjects, with view-independent colours.
+        gaussians: Gaussians of any number of subjects, with view-independent colours.
 
     Returns:
         The Gaussians with y and z of means and quaternions negated.
@@ -58,8 +58,8 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
     """Convert Gaussians to another program's format with the package gaussforge.
 
     Args:
-        name: of the format, in ``CONVERTED``.
-        gaussians: of one subject, with RGB colours.
+        name: name of the format in ``CONVERTED``.
+        gaussians: Gaussians of one subject, with RGB colours.
 
     Returns:
         The content of the file.
@@ -228,7 +228,7 @@ def write_prediction(
         directory: files of an earlier prediction are replaced, others remain.
         batch: photographs, masks and cameras of the subject; the overview compares renderings with its
             targets, or with the photographs if it has none.
-        prediction: for this batch, in the world of its cameras.
+        prediction: prediction for this batch, in the world of its cameras.
         renderer: renders the turntable, and the input views for the report.
         options: formats and their options.
         facts: further plain data for the report.

@@ -19,7 +19,7 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
     Args:
         directory: where files will be written.
-        names: of the files, relative to the directory; the report is checked, too.
+        names: names of the files, relative to the directory; the report is checked, too.
         inputs: input files of the prediction.
 
     Raises:
@@ -40,7 +40,7 @@ def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
 
     Args:
         directory: where files will be written.
-        names: of the files, relative to the directory.
+        names: names of the files, relative to the directory.
 
     Returns:
         Names of other files of earlier predictions.
@@ -57,7 +57,7 @@ def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) 
 
     Args:
         directory: where the files are.
-        names: of the files, relative to the directory.
+        names: names of the files, relative to the directory.
         report: plain data, without NaN or infinity.
 
     Returns:
@@ -72,7 +72,7 @@ def write_file(path: Path, content: Callable[[], bytes]) -> None:
     """Compute a file's content and write it atomically.
 
     Args:
-        path: of the file.
+        path: path of the file.
         content: returns the content.
     """
     made = content()

@@ -230,7 +230,7 @@ def exported_subject(
 
     Args:
         batch: photographs, masks and cameras of one subject.
-        prediction: for this batch, in the world of its cameras.
+        prediction: prediction for this batch, in the world of its cameras.
         renderer: renders the images in the files.
         options: kept with the subject.
 

@@ -65,8 +65,8 @@ def with_instants(run: Adapt, directory: Path) -> Adapt:
     the inputs.
 
     Args:
-        run: as configured.
-        directory: of the run; instants are written to its folder ``instants``.
+        run: the run as configured.
+        directory: directory of the run; instants are written to its folder ``instants``.
 
     Raises:
         InputError: there is only one instant, or fewer than three cameras, or more than eight.
@@ -129,7 +129,7 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
 
     Args:
         run: from :func:`with_instants`.
-        directory: of the run; the weights are written there unless ``out`` is given.
+        directory: directory of the run; the weights are written there unless ``out`` is given.
         stats: receives statistics of the training, as for :func:`ghgs_lit.cli.train.train`.
 
     Returns:

@@ -186,7 +186,7 @@ def shared_by(
     """Estimate tone curves, static backgrounds and corrected cameras of a sequence from some instants.
 
     Args:
-        folder: of several instants.
+        folder: folder with several instants.
         model: in evaluation mode.
         size: (height, width) of the crops in pixels.
         refining: ``refine_cameras``, ``refine_masks`` and ``tones`` as for
@@ -244,8 +244,8 @@ def captures_of(folder: CaptureFolder, names: Sequence[str] | None = None) -> It
     If there are several, those that cannot be read are left out with a message.
 
     Args:
-        folder: of one instant or several.
-        names: of the instants; None: all.
+        folder: folder with one or several instants.
+        names: names of the instants; None: all.
 
     Raises:
         InputError: the only instant cannot be read.
@@ -283,7 +283,7 @@ def write_result(
 
     Args:
         directory: where files are written.
-        result: of one subject.
+        result: prediction of one subject.
         renderer: renders the images in the files.
         checkpoint: name of the weights, for the report.
         options: formats and their options.

@@ -40,7 +40,7 @@ class Character:
     ``first`` is the initial pose; ``motion_rng`` samples others.
 
     Args:
-        seed: of a family of people, at least 0.
+        seed: seed of a population, at least 0.
         index: number of the person in its family, at least 0.
         active: whether ``first`` is a pose of sport or dance.
 
@@ -103,7 +103,7 @@ def generate(seed: int, index: int, active: bool = False) -> Person:
     clothes, hair and a cap follow.
 
     Args:
-        seed: of a family of people, at least 0.
+        seed: seed of a population, at least 0.
         index: number of the person in its family, at least 0.
         active: whether the pose is one of sport or dance.
 
@@ -124,7 +124,7 @@ def pose_figure(
         body: the base mesh.
         coefficients: [k] of the person's shape.
         rng: samples the pose.
-        active: as in sport or dance.
+        active: sample poses of sport or dance.
 
     Returns:
         The naked person; after `MAX_POSES` attempts the last one.
@@ -175,7 +175,7 @@ def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Gener
     Args:
         figure: the wearer.
         outfit: what is worn.
-        spheres: of the body in the pose, which cast shadows.
+        spheres: spheres of the body in the pose, which cast shadows.
         rng: samples folds, emblems and trims.
     """
     noise = Noise(rng, 2.3, 3.0, 128)
@@ -240,7 +240,7 @@ def skin_part(
         figure: the person.
         outfit: what covers the skin.
         look: colours of the person.
-        spheres: of the body in the pose, which cast shadows.
+        spheres: spheres of the body in the pose, which cast shadows.
         scalp: how strongly hair covers the scalp, 0 to 1.
     """
     textures = {

@@ -143,8 +143,8 @@ def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tup
     Args:
         uv: [n, 2] in [0, 1], origin at the bottom left.
         faces: [m, 3] over the n points.
-        height: of the texture, texels.
-        width: of the texture, texels.
+        height: height of the texture, texels.
+        width: width of the texture, texels.
 
     Returns:
         Flat indices [k] of the covered texels, their face [k] and barycentric coordinates

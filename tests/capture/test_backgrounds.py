@@ -93,7 +93,7 @@ def smaller():
     return mask & np.roll(mask, 2, 0) & np.roll(mask, 2, 1)
 
 
-# Options of all instants, and those of instant 3 beside them.
+# Options of all instants, and further ones of instant 3.
 KEPT = {
     "right masks": ({}, {}),
     "outlines that are off": ({}, {"mask": smaller()}),

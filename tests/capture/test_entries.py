@@ -26,7 +26,7 @@ OWN = {"intrinsics": CAMERA["K"], "extrinsics": np.eye(4).tolist()}
 # Entries next to a camera's matrices, and the lens that they define: coefficients, and whether fisheye.
 LENSES = [
     *(({spelling: LENS}, LENS, False) for spelling in SPELLINGS),
-    *(({spelling: [LENS]}, LENS, False) for spelling in SPELLINGS),  # a row of a matrix, as of NumPy
+    *(({spelling: [LENS]}, LENS, False) for spelling in SPELLINGS),  # a row of a matrix, as from NumPy
     (dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True)), [*LENS, 0, 0, 0], False),
     (SINGLE | {"is_fisheye": True}, [0.1, 0.2, 0.3, 0.4], True),
     # As written by Kalibr and ROS, next to a pinhole.

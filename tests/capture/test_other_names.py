@@ -212,7 +212,7 @@ def test_cameras_that_differ_by_case_alone(capture):
 
 
 def test_masks_that_a_windows_program_names(capture):
-    """``masks\\cam0.PNG`` beside transforms.json is ``masks/cam0.png``."""
+    """``masks\\cam0.PNG`` next to transforms.json is ``masks/cam0.png``."""
     own = json.loads((capture / "cameras.json").read_text())["cameras"]
     frames = [frame(f".\\images\\{n}.png", mask_path=f"masks\\{n}.PNG") for n in own]
     for entry, camera in zip(frames, own.values(), strict=True):

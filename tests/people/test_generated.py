@@ -30,7 +30,7 @@ def test_configuration_groups_build(views, targets, tmp_path):
     data = built("data=scans", f"views={views}", f"targets={targets}")
     assert data.targets.name == targets
     assert data.views.evaluation_count == {"v3": 3, "v4": 4, "v5": 5, "random": 4}[views]
-    # Evaluating another protocol by its name gives what its file says.
+    # Evaluating another protocol by its name gives the values of its file.
     by_name = TargetProtocol(name=targets)
     assert (data.targets.kind, data.targets.view, data.targets.per_subject) == (
         by_name.kind,

@@ -289,7 +289,7 @@ def test_shadows_are_soft():
 
     light = lights.shade(points, np.tile(np.float32([0, 1, 0]), (len(points), 1)), is_blocked)[:201, 0]
     x = np.clip(fine / (height * np.tan(np.radians(20))), -1, 1)
-    # of the disc beside the screen
+    # part of the disc next to the screen
     share = 1 - (np.pi / 2 + np.arcsin(x) + x * np.sqrt(1 - x**2)) / np.pi
     cosine = (lights.directions[0] @ [0, 1, 0]).mean()
     # Two of twelve samples.

@@ -26,7 +26,7 @@ def test_obj_scans_are_loaded_as_they_are(tmp_path):
     assert np.abs(part.texture.reshape(-1, 3).mean(0) - [200, 90, 30]).max() < 3
     assert person.body_vertices.dtype == np.float32
     assert len(person.body_vertices) == 8
-    # often lost: the picture beside the mesh is found anyway
+    # often lost: the picture next to the mesh is found anyway
     (tmp_path / "a" / "material0.mtl").unlink()
     assert ScanSource(tmp_path).load("a").parts[0].texture.shape == (4, 4, 3)
 
@@ -37,7 +37,7 @@ def test_names_of_windows_programs(tmp_path):
     folder = tmp_path / "a"
     (folder / "textures").mkdir()
     (folder / "material0.jpeg").rename(folder / "textures" / "My Skin.JPEG")
-    # beside the mesh, so that nothing is guessed
+    # next to the mesh, so that nothing is guessed
     Image.new("RGB", (4, 4)).save(folder / "black.png")
     Image.new("RGB", (4, 4)).save(folder / "white.png")
     (folder / "material0.mtl").rename(folder / "Material0.MTL")
@@ -189,7 +189,7 @@ def test_rendered_scans_share_one_transform(tmp_path):
     render_boxes(tmp_path / "out", tmp_path / "scans", train=1, val=0)
     layout = Layout(tmp_path / "out", "train")
     body = layout.read_body("s0")
-    assert body[:, 1].min() == pytest.approx(0, abs=2e-3)  # stored in 16 bits beside the mesh
+    assert body[:, 1].min() == pytest.approx(0, abs=2e-3)  # stored in 16 bits next to the mesh
     assert 1.75 <= np.ptp(body[:, 1]) <= 1.85
     for position in layout.subjects["s0"][::5]:
         for number in layout.views_at("s0", position):
