@@ -41,7 +41,7 @@ class Character:
 
     Args:
         seed: seed of a population, at least 0.
-        index: number of the person in its family, at least 0.
+        index: number of the person in its population, at least 0.
         active: whether ``first`` is a pose of sport or dance.
 
     Raises:
@@ -104,7 +104,7 @@ def generate(seed: int, index: int, active: bool = False) -> Person:
 
     Args:
         seed: seed of a population, at least 0.
-        index: number of the person in its family, at least 0.
+        index: number of the person in its population, at least 0.
         active: whether the pose is one of sport or dance.
 
     Raises:
