@@ -145,13 +145,13 @@ def batches(
     targets = [read_option("targets", name) for name in _TARGETS]
     for batch in clean.evaluation_loader(_VIEWS, targets, batch_size=1):
         subject = batch.subjects[0]
-        taken = photographed(capture, own.evaluation_batch(subject, views=_VIEWS))
+        taken = photograph(capture, own.evaluation_batch(subject, views=_VIEWS))
         seen = taken.batch(size, refine_masks)
         cameras = seen.cameras.to(torch.float32)  # for baselines
         yield dataclasses.replace(seen, cameras=cameras, targets=batch.targets)
 
 
-def predicted(
+def predict_people(
     capture: Imperfection,
     data: tuple[PhotographsDataModule, PhotographsDataModule],
     first: int,
@@ -164,7 +164,7 @@ def predicted(
     targets = [read_option("targets", name) for name in _TARGETS]
     clean, own = data
     for subject in list(clean.subjects("val"))[first:]:
-        taken = photographed(capture, own.evaluation_batch(subject, views=_VIEWS))
+        taken = photograph(capture, own.evaluation_batch(subject, views=_VIEWS))
         keys = {"refine_cameras": refine, "refine_masks": refine, "tones": refine or {}}
         result = predict(taken, model, size, **keys, renderer=renderer)
         if refine:
@@ -175,7 +175,7 @@ def predicted(
         yield dataclasses.replace(result.batch, cameras=cameras, targets=batch.targets)
 
 
-def photographed(capture: Imperfection, batch: Batch) -> Capture:
+def photograph(capture: Imperfection, batch: Batch) -> Capture:
     """Capture of one subject, composed with a background, from images on black."""
     subject = batch.subjects[0]
     limits = {k: v * (_LARGER if k in _PIXELS else 1) for k, v in capture.augmentation.items()}
@@ -252,7 +252,7 @@ def measure_mending(
         print(name, flush=True)
         shown = []
         for refine in (0, "auto"):
-            seen = predicted(capture, data, options.first, model, size, renderer, refine)
+            seen = predict_people(capture, data, options.first, model, size, renderer, refine)
             row = means(measure(method, name, seen, metrics, device))
             shown += [f"{row[f'{target}_psnr']:.2f}" for target in _TARGETS]
         print(f"| {name} | {' | '.join(shown)} |", flush=True)

@@ -99,7 +99,7 @@ class Gsplat:
 
 
 @contextmanager
-def drawing_nothing() -> Iterator[None]:
+def render_nothing() -> Iterator[None]:
     """Render through the gsplat backend with a stand-in for gsplat."""
     with (
         mock.patch.object(api, "resolve_backend", return_value="gsplat"),
@@ -154,7 +154,7 @@ def main() -> None:
     options = parser.parse_args()
     run = run_of("train", ["encoder=vggt_nano", *options.overrides])
     predictions, steps = [], []
-    with pretend_device(options.lines) as log, drawing_nothing():
+    with pretend_device(options.lines) as log, render_nothing():
         model = GHGS.from_config(run.plain).to(DEVICE)
         for size in options.batches:
             batch = ellipsoid_batch(0.15, options.views, options.size, size)

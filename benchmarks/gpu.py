@@ -208,13 +208,15 @@ def environment_of(options: argparse.Namespace) -> dict[str, str]:
     if options.gsplat is not None:
         paths.insert(0, str(options.gsplat))
     elif not options.dry and (found := importlib.util.find_spec("gsplat")) is not None:
-        paths.insert(0, str(fewer_channels(Path(found.origin).parent, options.work / "gsplat_source")))
+        paths.insert(
+            0, str(copy_with_fewer_channels(Path(found.origin).parent, options.work / "gsplat_source"))
+        )
     defaults = {"TORCH_EXTENSIONS_DIR": str(options.work / "extensions"), "GHGS_CACHE": str(options.work)}
     defaults |= {"MAX_JOBS": str(os.cpu_count()), "PYTHONUNBUFFERED": "1"}
     return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
-def fewer_channels(package: Path, folder: Path) -> Path:
+def copy_with_fewer_channels(package: Path, folder: Path) -> Path:
     """Copy gsplat to ``folder`` without its kernels for many channels, to compile in a third of the time."""
     if not folder.exists():
         shutil.copytree(package, folder / package.name)
@@ -243,7 +245,7 @@ def run_section(options: argparse.Namespace) -> None:
             sys.exit(reason(error))
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return str(value).replace("|", "/")
@@ -253,7 +255,9 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     """Format rows as Markdown, with a column for each of their numbers."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    return lines + [f"| {' | '.join(shown(row.get(column, '')) for column in columns)} |" for row in rows]
+    return lines + [
+        f"| {' | '.join(format_value(row.get(column, '')) for column in columns)} |" for row in rows
+    ]
 
 
 def report(found: list[dict[str, Any]]) -> str:

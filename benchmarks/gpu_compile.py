@@ -74,7 +74,7 @@ class Compiler:
                 compiled = triton.compile(source, GPUTarget("cuda", capability, 32), {"num_warps": num_warps})
                 switches = [name.lower() for name, value in flags.items() if value is True]
                 title = " ".join((kernel.__name__.removesuffix("_rows"), *switches))
-                print(f"{title}: {capability}, {_needs(compiled)}", flush=True)
+                print(f"{title}: {capability}, {_count_registers(compiled)}", flush=True)
 
 
 def _type(value: Any) -> str:
@@ -86,7 +86,7 @@ def _type(value: Any) -> str:
     return {float: "fp32", int: "i32"}[type(value)]
 
 
-def _needs(compiled: Any) -> str:
+def _count_registers(compiled: Any) -> str:
     """Registers per thread, and spilled bytes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "kernel.ptx"
@@ -98,7 +98,7 @@ def _needs(compiled: Any) -> str:
     return f"{registers} registers, {spilled[1] if spilled else 0} bytes spilled"
 
 
-def compiled_too(operator: dispatch.Operator) -> Callable[..., Any]:
+def call_both(operator: dispatch.Operator) -> Callable[..., Any]:
     """An operator in plain PyTorch that also calls its kernel."""
 
     def call(*inputs):
@@ -117,12 +117,12 @@ def main() -> None:
         library = stack.enter_context(_scoped_library("ghgs_lit", "IMPL"))
         for name, operator in dispatch.OPERATORS.items():
             if "cuda" in operator.kernels:
-                library.impl(name, compiled_too(operator), "CPU", allow_override=True)
+                library.impl(name, call_both(operator), "CPU", allow_override=True)
         stack.enter_context(mock.patch.object(dispatch, "DEVICES", {"cpu"}))
         stack.enter_context(
             mock.patch.object(triton.JITFunction, "run", lambda *a, **b: compiler.run(*a, **b))
         )
-        stack.enter_context(device.drawing_nothing())
+        stack.enter_context(device.render_nothing())
         round_products(True, "cpu")  # as on a GPU
         for overrides in (("model=recurrent",), ("model=hull", "skip=fast")):
             model = GHGS.from_config(run_of("train", [*SMALL, *overrides]).plain)

@@ -23,7 +23,7 @@ from unittest import mock
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks.device import drawing_nothing
+from benchmarks.device import render_nothing
 from ghgs_lit.config import run_of
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
@@ -126,7 +126,7 @@ def reason(error: BaseException) -> str:
 @contextlib.contextmanager
 def rehearsal() -> Iterator[Gpu]:
     """The pretend device of the tests as a GPU, with stand-ins for CUDA-only parts of PyTorch."""
-    with pretend_device(), drawing_nothing(), contextlib.ExitStack() as stack:
+    with pretend_device(), render_nothing(), contextlib.ExitStack() as stack:
         for name, value in _stand_ins().items():
             stack.enter_context(mock.patch.object(torch.cuda, name, value))
         stack.enter_context(mock.patch.object(torch, "compile", lambda function, **_: function))

@@ -24,7 +24,7 @@ def other_scene(batch: Batch) -> Batch:
     return replace(batch, images=0.6 * batch.images, cameras=replace(batch.cameras, extrinsics=extrinsics))
 
 
-def apart(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
+def relative_distance(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
     """Largest relative distance between tensors.
 
     Each is relative to the norm of the wanted tensor, or to a thousandth of the largest norm: small
@@ -37,7 +37,7 @@ def apart(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
     return float(torch.stack(shares).max())  # nan propagates
 
 
-def judged(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[Tensor]]) -> None:
+def judge(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[Tensor]]) -> None:
     """Add a row that compares a replayed call with two eager ones.
 
     Args:
@@ -48,7 +48,7 @@ def judged(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[
     """
     before = cache.counts["replayed"]
     found, wanted, again = (run(may_replay) for may_replay in (True, False, False))
-    numbers = {"apart": apart(found, wanted), "noise": apart(again, wanted)}
+    numbers = {"apart": relative_distance(found, wanted), "noise": relative_distance(again, wanted)}
     # False for nan.
     holds = numbers["apart"] <= max(ROUNDING, 10 * numbers["noise"])
     is_replayed = cache.counts["replayed"] > before
@@ -56,7 +56,7 @@ def judged(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[
     call.add(f"{name}, replay beside eager", verdict=verdict, **numbers)
 
 
-def here(tensors: Iterable[Tensor]) -> list[Tensor]:
+def copy_to_cpu(tensors: Iterable[Tensor]) -> list[Tensor]:
     """Copies on the CPU, in float64."""
     return [tensor.detach().cpu().double() for tensor in tensors]
 
@@ -73,14 +73,14 @@ def judge_prediction(call: Call, name: str, predictor: Predictor, batch: Batch) 
     """
     other, options = other_scene(batch), predictor.options
 
-    def predicted(may_replay: bool) -> list[Tensor]:
+    def predict_other(may_replay: bool) -> list[Tensor]:
         capture = "auto" if may_replay else "off"
         predictor.options = options.replace(capture=capture)
         gaussians = predictor(other).gaussians
         values = [getattr(gaussians, field.name) for field in fields(gaussians)]
-        return here(x for x in values if isinstance(x, Tensor) and x.is_floating_point())
+        return copy_to_cpu(x for x in values if isinstance(x, Tensor) and x.is_floating_point())
 
-    judged(call, name, predictor.graphs, predicted)
+    judge(call, name, predictor.graphs, predict_other)
     predictor.options = options
 
 
@@ -95,14 +95,14 @@ def judge_step(call: Call, name: str, step: Any) -> None:
     batch, step.host = step.host, other_scene(step.host)
     step.data()
 
-    def differentiated(may_replay: bool) -> list[Tensor]:
+    def differentiate(may_replay: bool) -> list[Tensor]:
         step.optimizer.zero_grad()
-        total = step.replayed() if may_replay else step.called()
+        total = step.replay_loss() if may_replay else step.compute_loss()
         total.backward()
         slopes = [weight.grad for weight in step.model.parameters() if weight.grad is not None]
-        return here([total, *slopes])
+        return copy_to_cpu([total, *slopes])
 
-    judged(call, name, step.captured_step.graphs, differentiated)
+    judge(call, name, step.captured_step.graphs, differentiate)
     step.host = batch
 
 
@@ -123,16 +123,19 @@ def judge_optimizer(call: Call, name: str, step: Any) -> None:
     before = [tensor.clone() for tensor in written]
     moved = [weight for weight in weights if weight in optimizer.state]
 
-    def stepped(may_replay: bool) -> list[Tensor]:
+    def step_optimizer(may_replay: bool) -> list[Tensor]:
         for number, weight in enumerate(moved):
             weight.grad = weight.detach().roll(1).mul(0.5 + number % 3)
         optimizer.graphs = cache if may_replay else None
         optimizer.step()
-        changes = [new - old for new, old in zip(here(weights), here(before[: len(weights)]), strict=True)]
+        changes = [
+            new - old
+            for new, old in zip(copy_to_cpu(weights), copy_to_cpu(before[: len(weights)]), strict=True)
+        ]
         for tensor, value in zip(written, before, strict=True):
             tensor.copy_(value)
         return changes
 
-    judged(call, name, cache, stepped)
+    judge(call, name, cache, step_optimizer)
     optimizer.graphs = cache
     optimizer.zero_grad()

@@ -49,13 +49,13 @@ def machine(call: Call) -> None:
         call.add(f"product, {name}", ms=ms, tflop_s=2 * sizes.product**3 / ms / 1e9)
 
 
-def _built(call: Call, run: Run) -> GHGS:
+def _build(call: Call, run: Run) -> GHGS:
     """A model with fresh weights, created on the device."""
     with call.gpu.device:
         return GHGS.from_config(run.plain).to(call.gpu.device)
 
 
-def _predicted(
+def _measure_prediction(
     call: Call, name: str, predictor: Predictor, batch: Batch, precisions: Sequence[str] = PRECISIONS
 ) -> None:
     """Add rows of a prediction in each precision."""
@@ -77,19 +77,21 @@ def _predicted(
 
 def prediction(call: Call) -> None:
     """A prediction of the shipped weights, eager and replayed"""
-    predictor = _capturing(call, Predictor.from_checkpoint(map_location=call.gpu.device))
+    predictor = _enable_capture(call, Predictor.from_checkpoint(map_location=call.gpu.device))
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
         for capture in ("off", "auto"):
             predictor.options = predictor.options.replace(capture=capture)
-            _predicted(call, f"{call.sizes.side}², batch of {size}, capture={capture}", predictor, batch)
+            _measure_prediction(
+                call, f"{call.sizes.side}², batch of {size}, capture={capture}", predictor, batch
+            )
         for predictor.precision in PRECISIONS:
             judge_prediction(call, f"batch of {size}, {predictor.precision}", predictor, batch)
         cache = predictor.graphs
         call.add(f"batch of {size}, graphs", reason="; ".join(cache.reasons), **cache.counts)
 
 
-def _capturing(call: Call, predictor: Predictor) -> Predictor:
+def _enable_capture(call: Call, predictor: Predictor) -> Predictor:
     """The predictor with a graph cache for this device."""
     predictor.graphs = GraphCache(backend=call.gpu.backend())
     return predictor
@@ -97,17 +99,19 @@ def _capturing(call: Call, predictor: Predictor) -> Predictor:
 
 def paper(call: Call) -> None:
     """A prediction of a large encoder, model=paper"""
-    model = _built(call, call.run(f"encoder={call.sizes.encoder}", "model=paper")).eval()
+    model = _build(call, call.run(f"encoder={call.sizes.encoder}", "model=paper")).eval()
     predictor = Predictor(model)
     predictor.options = predictor.options.replace(capture="off")
     batch = replace(call.batch(1, call.sizes.large), targets=None).to(call.gpu.device)
     name = f"{call.sizes.encoder}, {call.sizes.large}²"
-    _predicted(call, name, predictor, batch)
+    _measure_prediction(call, name, predictor, batch)
     if call.gpu.is_real:  # a rehearsal has no autocast
         keep_rounded(model.encoder, torch.bfloat16)
-    _predicted(call, f"{name}, rounded weights", predictor, batch, ("bfloat16",))
+    _measure_prediction(call, f"{name}, rounded weights", predictor, batch, ("bfloat16",))
     with sdpa_kernel([SDPBackend.CUDNN_ATTENTION, *ATTENTION], set_priority=True):
-        _predicted(call, f"{name}, rounded weights, cuDNN's attention first", predictor, batch, ("bfloat16",))
+        _measure_prediction(
+            call, f"{name}, rounded weights, cuDNN's attention first", predictor, batch, ("bfloat16",)
+        )
 
 
 class _Step:
@@ -115,11 +119,11 @@ class _Step:
 
     def __init__(self, call: Call, run: Run, batch: Batch, autocast: bool = False):
         self.device, self.host, self.autocast = call.gpu.device, batch, autocast
-        self.model = _built(call, run).train()
+        self.model = _build(call, run).train()
         if not isinstance(self.model.rounds, NoRounds):
             self.model.rounds.options = self.model.rounds.options.replace(training_counts=(2,))
         self.renderer, self.losses = run.renderer.build(), run.loss.build()
-        self.predictor = _capturing(call, Predictor(self.model))
+        self.predictor = _enable_capture(call, Predictor(self.model))
         self.captured_step = CapturedStep(self.predictor, self.renderer, self.losses)
         self.captured_step.graphs = GraphCache(backend=call.gpu.backend())
         self.options = run.optimizer
@@ -149,22 +153,22 @@ class _Step:
         self.optimizer.step()
         self.optimizer.zero_grad()
 
-    def called(self) -> Tensor:
+    def compute_loss(self) -> Tensor:
         """The loss, operator by operator; all under autocast, as in training."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             for part in (self.forward, self.render, self.loss):
                 part()
         return self.total
 
-    def replayed(self) -> Tensor:
+    def replay_loss(self) -> Tensor:
         """The loss, with stages, rendering and gradients replayed."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             return self.captured_step(self.batch).total
 
-    def captured(self) -> None:
+    def run_captured(self) -> None:
         """The replayed step."""
         self.data()
-        self.replayed().backward()
+        self.replay_loss().backward()
         self.optimize()
 
     @property
@@ -176,7 +180,7 @@ class _Step:
             part()
 
 
-def _stepped(call: Call, name: str, step: _Step) -> None:
+def _measure_step(call: Call, name: str, step: _Step) -> None:
     """Add rows of a step: as a whole, and for each part."""
     torch.cuda.reset_peak_memory_stats()
     ms = call.gpu.milliseconds(step, call.sizes.repeats)
@@ -186,11 +190,11 @@ def _stepped(call: Call, name: str, step: _Step) -> None:
         call.add(f"{name}: {part.__name__}", ms=ms, **call.gpu.work(part, 1))
 
 
-def _captured(call: Call, name: str, step: _Step) -> None:
+def _measure_captured_step(call: Call, name: str, step: _Step) -> None:
     """Add rows of a replayed step: its time, and its agreement with eager calls."""
-    ms = call.gpu.milliseconds(step.captured, call.sizes.repeats)
+    ms = call.gpu.milliseconds(step.run_captured, call.sizes.repeats)
     cache = step.captured_step.graphs
-    work = call.gpu.work(step.captured, 2)
+    work = call.gpu.work(step.run_captured, 2)
     call.add(f"{name}, captured", ms=ms, reason="; ".join(cache.reasons), **work, **cache.counts)
     judge_step(call, name, step)
     judge_optimizer(call, f"{name}, optimizer", step)
@@ -201,8 +205,8 @@ def step(call: Call) -> None:
     for size in reversed(call.sizes.batches):
         made = _Step(call, call.run(*call.shipped), call.batch(size, call.sizes.side))
         with precision_of("tf32", torch.device("cuda")):  # as trainer=gpu
-            _stepped(call, f"batch of {size}", made)
-            _captured(call, f"batch of {size}", made)
+            _measure_step(call, f"batch of {size}", made)
+            _measure_captured_step(call, f"batch of {size}", made)
         del made
         gc.collect()
 
@@ -215,8 +219,8 @@ def frozen(call: Call) -> None:
     for size in call.sizes.large_batches:
         try:
             made = _Step(call, call.run(*encoder), call.batch(size, call.sizes.large), autocast=True)
-            _stepped(call, f"batch of {size}", made)
-            _captured(call, f"batch of {size}", made)
+            _measure_step(call, f"batch of {size}", made)
+            _measure_captured_step(call, f"batch of {size}", made)
         except torch.cuda.OutOfMemoryError as error:
             call.add(f"batch of {size}", refused=reason(error))
         made = None
@@ -253,15 +257,15 @@ def kernels(call: Call) -> None:
     for name, (function, inputs) in calls.inputs.items():
         moved[name] = _bytes(inputs) + _bytes(function(*inputs))
         for kind, run in {"kernel": function, "eager": OPERATORS[name].plain}.items():
-            _chain(call, name, kind, partial(run, *inputs), moved[name])
-    _attention(call)
+            _measure_operator(call, name, kind, partial(run, *inputs), moved[name])
+    _measure_attention(call)
     for name, (_, inputs) in calls.inputs.items():  # the slowest part
         compiled = torch.compile(OPERATORS[name].plain, dynamic=False)
-        _chain(call, name, "compiled", partial(compiled, *inputs), moved[name])
+        _measure_operator(call, name, "compiled", partial(compiled, *inputs), moved[name])
 
 
 @torch.no_grad()
-def _chain(call: Call, name: str, kind: str, run: Callable[[], Any], moved: int) -> None:
+def _measure_operator(call: Call, name: str, kind: str, run: Callable[[], Any], moved: int) -> None:
     """Add a row of an operator; its rate is by the bytes of its inputs and outputs."""
     try:
         ms, work = call.gpu.milliseconds(run, call.sizes.repeats), call.gpu.work(run)
@@ -282,7 +286,7 @@ def _bytes(value: Any) -> int:
 
 
 @torch.no_grad()
-def _attention(call: Call) -> None:
+def _measure_attention(call: Call) -> None:
     """Add rows of the global attention of ``vggt_1b`` in bfloat16."""
     tokens = call.sizes.views * ((call.sizes.large // 14) ** 2 + 5)
     q, k, v = torch.rand(3, 1, 16, tokens, 64, device=call.gpu.device, dtype=torch.bfloat16)

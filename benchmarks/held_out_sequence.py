@@ -78,7 +78,7 @@ class Measured:
         self.folder = CaptureFolder(images, cameras)
         self.out = out
         self.weights = weights
-        self.models = {name: [_model(path) for path in paths] for name, paths in weights.items()}
+        self.models = {name: [_load_model(path) for path in paths] for name, paths in weights.items()}
         self.renderer = Renderer()
         self.size = crop_size(None, read_config(weights["shipped"][0]), self.models["shipped"][0])
         self.names = self.folder.instants[::step]
@@ -86,14 +86,14 @@ class Measured:
         self.results: dict[str, Any] = {"step": step, "weights": weights, "rows": {}}
         out.mkdir(parents=True, exist_ok=True)
 
-    def kept(self, name: str, make: Callable[[], Any]) -> Any:
+    def load_or_make(self, name: str, make: Callable[[], Any]) -> Any:
         path = self.out / f"{name}.pt"
         if not path.exists():
             torch.save(make(), path.with_suffix(".part"))
             path.with_suffix(".part").rename(path)
         return torch.load(path, weights_only=False)
 
-    def say(self, way: str, subject: str, rows: Sequence[Sequence[float]]) -> None:
+    def log_rows(self, way: str, subject: str, rows: Sequence[Sequence[float]]) -> None:
         """Store the results of all cameras of an instant in the JSON file; log the box's PSNR."""
         columns = (dict(zip(COLUMNS, row, strict=True)) for row in rows)
         self.results["rows"].setdefault(way, {})[subject] = dict(zip(self.cameras, columns, strict=True))
@@ -103,9 +103,9 @@ class Measured:
     @functools.cached_property
     def shared(self) -> tuple[Backgrounds, Rig | None, float]:
         """Backgrounds, rig, and their CPU seconds."""
-        return self.kept("shared", self.found)
+        return self.load_or_make("shared", self.find_rig)
 
-    def found(self) -> tuple[Backgrounds, Rig | None, float]:
+    def find_rig(self) -> tuple[Backgrounds, Rig | None, float]:
         begin = time.process_time()
         names = spread(self.folder.instants, BACKGROUND_INSTANTS)
         captures = [Capture(name, self.folder.photographs(name)) for name in names]
@@ -141,7 +141,7 @@ class Measured:
         return truths
 
     @torch.no_grad()
-    def drawn(self, way: str, name: str, view: int) -> tuple[Tensor, float]:
+    def render_view(self, way: str, name: str, view: int) -> tuple[Tensor, float]:
         """Render a held-out camera.
 
         Returns:
@@ -149,8 +149,8 @@ class Measured:
         """
         masks, cameras, gains, weights = WAYS[way]
         rig = self.shared[1]
-        truth = self.kept(f"truth_{name}", partial(self.truth, name))[view]
-        read = self.kept(f"batch_{masks}_{cameras}_{name}", partial(self.batch, masks, cameras, name))
+        truth = self.load_or_make(f"truth_{name}", partial(self.truth, name))[view]
+        read = self.load_or_make(f"batch_{masks}_{cameras}_{name}", partial(self.batch, masks, cameras, name))
         batch, lenses, before = read
         models = self.models[weights]
         model = models[self.folder.instants.index(name) % len(models)]
@@ -158,7 +158,7 @@ class Measured:
         seen = batch.of_views([other for other in range(len(lenses)) if other != view])
         gaussians = in_frame(model, with_gains_of(rig, seen) if gains == "once" else seen).gaussians
         seconds = time.process_time() - begin + before
-        shown = self.renderer(gaussians, _halved(lenses[view], batch, view, truth))
+        shown = self.renderer(gaussians, _half_size_camera(lenses[view], batch, view, truth))
         image = torch.cat([shown.image[0, 0], shown.alpha[0, 0]]).clamp(0, 1)
         return (255 * image).round().byte(), seconds
 
@@ -167,16 +167,16 @@ class Measured:
         found: list[list[list[float]]] = []
         for name in self.names:
             found.append([])
-            truths = self.kept(f"truth_{name}", partial(self.truth, name))
+            truths = self.load_or_make(f"truth_{name}", partial(self.truth, name))
             for view, truth in enumerate(truths):
                 image = torch.zeros(4, *truth["mask"].shape, dtype=torch.uint8)
                 seconds = np.nan
                 if way != "black":
                     of_weights = "_".join(Path(path).stem for path in self.weights[WAYS[way][3]])
                     place = f"drawn_{way}_{of_weights}_{name}_{self.cameras[view]}"
-                    image, seconds = self.kept(place, partial(self.drawn, way, name, view))
-                found[-1].append([*compared(*(image.float() / 255).split([3, 1]), truth), seconds])
-            self.say(way, name, found[-1])
+                    image, seconds = self.load_or_make(place, partial(self.render_view, way, name, view))
+                found[-1].append([*compare(*(image.float() / 255).split([3, 1]), truth), seconds])
+            self.log_rows(way, name, found[-1])
         return np.array(found).swapaxes(0, 1)
 
 
@@ -207,7 +207,7 @@ def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
     return divide_by_gains(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
 
 
-def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[float]:
+def compare(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[float]:
     """PSNR of four kinds in dB, nan where the mask fails."""
     composed = image + (1 - alpha) * truth["behind"]
     off = (composed - truth["photograph"]) * truth["known"]
@@ -221,11 +221,11 @@ def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[flo
     return [np.nan if truth["fails"] else value.item() for value in found]
 
 
-def _model(path: str) -> Predictor:
+def _load_model(path: str) -> Predictor:
     return Predictor.from_checkpoint(path)
 
 
-def _halved(lens: np.ndarray, batch: Batch, view: int, truth: dict[str, Tensor]) -> Cameras:
+def _half_size_camera(lens: np.ndarray, batch: Batch, view: int, truth: dict[str, Tensor]) -> Cameras:
     lens = torch.from_numpy(lens).clone()
     lens[:2] *= 0.5
     pose = batch.cameras.extrinsics[0, view]
@@ -235,16 +235,16 @@ def _halved(lens: np.ndarray, batch: Batch, view: int, truth: dict[str, Tensor])
 def _truth(photograph: Photograph, behind: Background, fails: bool) -> dict[str, Any]:
     sides = [side // 2 for side in photograph.mask.shape]
 
-    def halved(image: np.ndarray) -> Tensor:
+    def halve(image: np.ndarray) -> Tensor:
         small = torch.from_numpy(area_image(image.astype(np.uint8), *sides))
         return small.movedim(-1, 0).float() / 255 if small.dim() == 3 else small
 
     return {
-        "photograph": halved(photograph.image),
-        "behind": halved(behind.image.clip(0, 255).round()),
-        "known": halved(behind.known * np.uint8(255)) > 250,
-        "subject": halved(np.round(photograph.image * (photograph.matte[..., None] / 255.0))),
-        "mask": halved(photograph.matte) > 127,
+        "photograph": halve(photograph.image),
+        "behind": halve(behind.image.clip(0, 255).round()),
+        "known": halve(behind.known * np.uint8(255)) > 250,
+        "subject": halve(np.round(photograph.image * (photograph.matte[..., None] / 255.0))),
+        "mask": halve(photograph.matte) > 127,
         "fails": fails,
     }
 
@@ -266,7 +266,9 @@ def main() -> None:
     for way in ["black", *(way for way in options.ways if WAYS[way][3] in weights)]:
         print(line(way, measured.rows(way)), flush=True)
     rig, seconds = measured.shared[1:]
-    truths = [measured.kept(f"truth_{name}", partial(measured.truth, name)) for name in measured.names]
+    truths = [
+        measured.load_or_make(f"truth_{name}", partial(measured.truth, name)) for name in measured.names
+    ]
     failed = sum(truth["fails"] for each in truths for truth in each)
     print(f"rig: {seconds:.0f} s; moved by {rig and rig.moved} pixels, gains {rig and rig.gains}")
     count = len(measured.cameras) * len(measured.names)

@@ -30,7 +30,7 @@ ALONE = (0.0, -0.35, 0.0, 0.0)
 """The smallest of them, without larger ones that precede it in Holm's correction."""
 
 
-def draw(
+def sample_rows(
     rng: np.random.Generator, means: Sequence[float], deviations: Sequence[float], seeds: int, people: float
 ) -> list[pd.DataFrame]:
     """Sample the rows of a table: values by seed and subject.
@@ -52,7 +52,7 @@ def draw(
     return rows
 
 
-def marked(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float]:
+def mark_rows(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float]:
     """Whether each row but the first is marked against it, and the mean of the smallest differences."""
     shared = None if way == "pairs" else pool(rows)
     if way == "plain":
@@ -64,7 +64,7 @@ def marked(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float]:
     return [p < ALPHA for p in corrected[: len(comparisons)]], float(np.mean(smallest))
 
 
-def tables(
+def sample_tables(
     means: Sequence[float],
     ratios: Sequence[float],
     seeds: int,
@@ -89,7 +89,7 @@ def tables(
     """
     rng = np.random.default_rng(start)
     deviations = [DEVIATION * ratio for ratio in ratios]
-    found = [marked(draw(rng, means, deviations, seeds, people), way) for _ in range(trials)]
+    found = [mark_rows(sample_rows(rng, means, deviations, seeds, people), way) for _ in range(trials)]
     return np.array([marks for marks, _ in found]), float(
         np.sqrt(np.mean([smallest**2 for _, smallest in found]))
     )
@@ -102,19 +102,19 @@ def main(trials: int = 100) -> None:
     for name, ratios in (("alike", (1,)), ("reference twice", (2, 1)), ("reference and another", (2, 2, 1))):
         for rows, seeds in ((4, 3), (4, 5), (6, 3), (6, 6)):
             each = [*ratios, *[1] * rows][:rows]
-            marks = [tables([0] * rows, each, seeds, way, trials, 0.01)[0] for way in WAYS]
+            marks = [sample_tables([0] * rows, each, seeds, way, trials, 0.01)[0] for way in WAYS]
             shares = " | ".join(f"{each.any(axis=1).mean():.1%}" for each in marks)
             print(f"| {name} | {rows} | {seeds} | {shares} |")
     gains = " | ".join(f"{gain:+.2f} dB" for gain in PAPER[1:])
     print(f"\n| power | seeds | {ALONE[1]:+.2f} dB alone | {gains} |\n|{'---|' * 6}")
     for seeds in (3, 5):
         for way in WAYS:
-            alone = tables(ALONE, [1] * 4, seeds, way, trials)[0][:, :1].mean(axis=0)
-            power = [*alone, *tables(PAPER, [1] * 4, seeds, way, trials)[0].mean(axis=0)]
+            alone = sample_tables(ALONE, [1] * 4, seeds, way, trials)[0][:, :1].mean(axis=0)
+            power = [*alone, *sample_tables(PAPER, [1] * 4, seeds, way, trials)[0].mean(axis=0)]
             print(f"| {way} | {seeds} | {' | '.join(f'{share:.0%}' for share in power)} |")
     for seeds in (3, 5):
-        smallest = tables([0] * 4, [1] * 4, seeds, "pooled", trials)[1]
-        found = tables([0, smallest, 0, 0], [1] * 4, seeds, "pooled", trials, start=1)[0]
+        smallest = sample_tables([0] * 4, [1] * 4, seeds, "pooled", trials)[1]
+        found = sample_tables([0, smallest, 0, 0], [1] * 4, seeds, "pooled", trials, start=1)[0]
         print(f"\n{seeds} seeds could have shown {smallest:.2f} dB: found in {found[:, 0].mean():.0%}")
     print(f"\n{trials} tables each, {time.perf_counter() - started:.0f} s")
 

@@ -151,10 +151,10 @@ def reduce_rig(
         Indices of the kept bones, their parents' indices among them, and weights [n, kept].
     """
 
-    def merged(name: str) -> bool:
+    def is_merged(name: str) -> bool:
         return name.startswith(MERGED) or (name.startswith("toe") and not name.startswith("toe2-1"))
 
-    kept = [i for i, name in enumerate(names) if not merged(name)]
+    kept = [i for i, name in enumerate(names) if not is_merged(name)]
     target = {}
     for i, name in enumerate(names):
         j = i

@@ -105,14 +105,14 @@ def documents() -> list[str]:
 def commands(document: str) -> list[Command]:
     """The commands of a document in the order of the text, without repetitions."""
     text = (ROOT / document).read_text()
-    found = [*_in_blocks(document, text), *_in_prose(document, text)]
+    found = [*_find_in_blocks(document, text), *_find_in_prose(document, text)]
     first: dict[str, Command] = {}
     for command in sorted(found, key=lambda c: c.line):
         first.setdefault(command.text, command)
     return list(first.values())
 
 
-def _in_blocks(document: str, text: str) -> Iterator[Command]:
+def _find_in_blocks(document: str, text: str) -> Iterator[Command]:
     for block in re.finditer(r"^```(bash|python)\n(.*?)^```", text, re.M | re.S):
         first = text.count("\n", 0, block.start()) + 2
         if block[1] == "python":
@@ -130,15 +130,15 @@ def _in_blocks(document: str, text: str) -> Iterator[Command]:
                 yield Command(document, start, command)
 
 
-def _in_prose(document: str, text: str) -> Iterator[Command]:
+def _find_in_prose(document: str, text: str) -> Iterator[Command]:
     """Code spans that begin like a command and have an argument."""
-    prose = _without_blocks(text)
+    prose = _remove_blocks(text)
     program = r"(?:ghgs --help|ghgs\s\w+\s\S*(?:=|--help)|python \w+/|make \w|pip install|tensorboard )"
     for span in re.finditer(rf"(?<!`)`((?:\w+=\S+ )?{program}[^`]*)`(?!`)", prose):
         yield Command(document, prose.count("\n", 0, span.start()) + 1, " ".join(span[1].split()))
 
 
-def _without_blocks(text: str) -> str:
+def _remove_blocks(text: str) -> str:
     return re.sub(r"^```.*?^```", lambda block: "\n" * block[0].count("\n"), text, flags=re.M | re.S)
 
 
@@ -151,7 +151,7 @@ def stale_figures(document: str) -> list[str]:
     Returns:
         A line for each fault.
     """
-    text = _without_blocks((ROOT / document).read_text())
+    text = _remove_blocks((ROOT / document).read_text())
     named = re.findall(r"\b(?!a\d{7})(?=\d*[a-f])(?=[a-f]*\d)[0-9a-f]{7,8}\b", text)
     missing = [c for c in named if HISTORY and not re.search(f"^{c}", HISTORY, re.M)]
     faults = [f"{commit}: expected a commit of this repository" for commit in missing]
@@ -230,7 +230,7 @@ def check(document: str, folder: Path, fast: bool = False, listed: bool = False)
     needs_files = [c for c in chosen if c.reason is None and not re.search(r"--help|dry_run=true", c.text)]
     if needs_files and not listed:
         for text in BEFORE.get(document, ()):
-            _one(reader, f"{document} (before)", text.splitlines()[0], text, False, [], count)
+            _run_one(reader, f"{document} (before)", text.splitlines()[0], text, False, [], count)
     for command in chosen:
         place = f"{document}:{command.line}"
         script, reasons = command.script()
@@ -238,26 +238,26 @@ def check(document: str, folder: Path, fast: bool = False, listed: bool = False)
             count["not run"] += 1
             print(f"not run            {place}  {command.title}  ({command.reason})", flush=True)
         elif listed:
-            print(f"run                {place}  {command.title}{_why(reasons)}")
+            print(f"run                {place}  {command.title}{_join(reasons)}")
         else:
-            _one(reader, place, command.title, script, command.is_python, reasons, count)
+            _run_one(reader, place, command.title, script, command.is_python, reasons, count)
     return count
 
 
-def _one(
+def _run_one(
     reader: Reader, place: str, title: str, script: str, is_python: bool, reasons: list[str], count: Counter
 ) -> None:
     code, seconds, output = reader.run(script, is_python)
     count["failed" if code else "ran"] += 1
     print(
-        f"{'ran' if code == 0 else 'FAILED':<7}{seconds:5.0f} s {code:>4}  {place}  {title}{_why(reasons)}",
+        f"{'ran' if code == 0 else 'FAILED':<7}{seconds:5.0f} s {code:>4}  {place}  {title}{_join(reasons)}",
         flush=True,
     )
     if code:
         print(f"    as run: {script}\n    " + "\n    ".join(output.strip().splitlines()[-15:]), flush=True)
 
 
-def _why(reasons: Sequence[str]) -> str:
+def _join(reasons: Sequence[str]) -> str:
     return f"  ({'; '.join(dict.fromkeys(reasons))})" if reasons else ""
 
 

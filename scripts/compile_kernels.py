@@ -19,7 +19,7 @@ from ghgs_lit.rendering import Renderer
 BATCH = ellipsoid_batch(0.15, 4, 56, 1)
 
 
-def draw() -> None:
+def render_once() -> None:
     """Render an image and compute its gradients."""
     parts = (torch.rand(99, 3) - 0.5, torch.rand(99, 4), torch.rand(99, 3) / 9, torch.rand(99))
     gaussians = Gaussians(*(part.requires_grad_() for part in (*parts, torch.rand(99, 3))), (99,))
@@ -27,7 +27,7 @@ def draw() -> None:
 
 
 if __name__ == "__main__":
-    drawing = get_context("spawn").Process(target=draw)
+    drawing = get_context("spawn").Process(target=render_once)
     drawing.start()
     predictor = Predictor.from_checkpoint()
     model = predictor.model

@@ -166,7 +166,7 @@ def faults_of(sweep: Path, run: Path, steps: int) -> list[str]:
     return [f"{run.name}: {name}: {a}, expected {b}" for name, (a, b) in found.items() if a != b]
 
 
-def differing(a: Path, b: Path) -> list[str]:
+def find_differences(a: Path, b: Path) -> list[str]:
     """Names of the tensors that differ between the last weights of two runs."""
     states = [
         torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"] for run in (a, b)
@@ -196,7 +196,7 @@ def main() -> int:
     faults += [f"{len(runs)} runs have results, expected {count}"] * (len(runs) != count)
     faults += [fault for run in runs for fault in faults_of(drill.sweep, run, arguments.steps)]
     (undisturbed,) = (path.parent for path in whole.glob("*/metrics.json"))
-    tensors = differing(undisturbed, drill.sweep / undisturbed.name)
+    tensors = find_differences(undisturbed, drill.sweep / undisturbed.name)
     faults += [f"{len(tensors)} tensors differ from those of an undisturbed run"] * bool(tensors)
     table = drill.ghgs("table", f"runs={drill.sweep}", f"hydra.run.dir={arguments.out / 'table'}").wait()
     said = (arguments.out / "table" / "table.md").read_text() if table == 0 else "No results yet"

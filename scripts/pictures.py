@@ -50,12 +50,12 @@ def people(number: int, size: int) -> PhotographsDataModule:
     return data
 
 
-def drawn(prediction: Prediction, batch: Batch) -> Tensor:
+def render_target(prediction: Prediction, batch: Batch) -> Tensor:
     """Render the first target [3, h, w] of the batch."""
     return Renderer()(prediction.gaussians, batch.targets.cameras[:, :1]).image[0, 0].clamp(0, 1)
 
 
-def on_white(color: Tensor, alpha: Tensor) -> np.ndarray:
+def blend_on_white(color: Tensor, alpha: Tensor) -> np.ndarray:
     return to_uint8(color + 1 - alpha)
 
 
@@ -79,7 +79,7 @@ def cut(picture: np.ndarray, box: tuple[slice, slice], size: tuple[int, int]) ->
     return np.asarray(Image.fromarray(picture[box]).resize(size, Image.Resampling.LANCZOS))
 
 
-def turned(gaussians: Gaussians, capture: Batch, degrees: list[float]) -> list[np.ndarray]:
+def render_around(gaussians: Gaussians, capture: Batch, degrees: list[float]) -> list[np.ndarray]:
     """Render views of :data:`SIDE` pixels on white from directions around the subject."""
     angles = torch.tensor(degrees, dtype=torch.float64) * (math.pi / 180)
     cameras = orbit(capture.cameras[0], angles, subject_points(gaussians))
@@ -90,22 +90,22 @@ def turned(gaussians: Gaussians, capture: Batch, degrees: list[float]) -> list[n
     return [to_uint8(one.image[0, 0]) for one in images]
 
 
-def hero(batch: Batch, prediction: Prediction, folder: Path) -> None:
+def write_hero(batch: Batch, prediction: Prediction, folder: Path) -> None:
     """Write ``hero.png`` and ``turntable.webp``."""
     canvas = Image.new("RGB", (WIDTH * (1 + len(BETWEEN)), SIDE), "white")
     for place, photograph in enumerate(zip(batch.images[0], batch.alpha[0], strict=True)):
         box = box_of(photograph[1] > 0.5, WIDTH / SIDE)
-        tile = cut(on_white(*photograph), box, (WIDTH // 2, SIDE // 2))
+        tile = cut(blend_on_white(*photograph), box, (WIDTH // 2, SIDE // 2))
         canvas.paste(Image.fromarray(tile), (place % 2 * WIDTH // 2, place // 2 * SIDE // 2))
     pen = ImageDraw.Draw(canvas)
-    for place, picture in enumerate(turned(prediction.gaussians, batch, list(BETWEEN))):
+    for place, picture in enumerate(render_around(prediction.gaussians, batch, list(BETWEEN))):
         shown = torch.from_numpy((picture < 250).any(-1))
         tile = cut(picture, box_of(shown, WIDTH / SIDE), (WIDTH, SIDE))
         canvas.paste(Image.fromarray(tile), ((1 + place) * WIDTH, 0))
         pen.text(((1 + place) * WIDTH + 8, 4), f"prediction, half-way: {BETWEEN[place]} degrees", "black")
     pen.text((8, SIDE - 14), "four photographs", "black")
     canvas.quantize(256, dither=Image.Dither.NONE).save(folder / "hero.png", optimize=True)
-    frames = turned(prediction.gaussians, batch, [360 * i / FRAMES for i in range(FRAMES)])
+    frames = render_around(prediction.gaussians, batch, [360 * i / FRAMES for i in range(FRAMES)])
     first, *others = (Image.fromarray(frame) for frame in frames)
     first.save(
         folder / "turntable.webp", save_all=True, append_images=others, duration=80, loop=0, quality=80
@@ -118,7 +118,9 @@ def result(batch: Batch, prediction: Prediction) -> np.ndarray:
     rows = []
     boxes = [box_of(mask, 0.5) for mask in batch.masks[0]]
     photographs = zip(batch.images[0], batch.alpha[0], boxes, strict=True)
-    rows.append(([cut(on_white(image, alpha), box, size) for image, alpha, box in photographs], "photograph"))
+    rows.append(
+        ([cut(blend_on_white(image, alpha), box, size) for image, alpha, box in photographs], "photograph")
+    )
     for name, depths in (("depth", prediction.depth[0]), ("true depth", batch.depths[0])):
         tiles = []
         for depth, true, mask, box in zip(depths, batch.depths[0], batch.masks[0], boxes, strict=True):
@@ -126,7 +128,7 @@ def result(batch: Batch, prediction: Prediction) -> np.ndarray:
             tiles.append(cut(colorize(-depth, -far, -near, "turbo", mask), box, size))
         rows.append((tiles, name))
     pictures = [row(tiles, [name] * len(tiles)) for tiles, name in rows]
-    return stack([*pictures, comparison(batch, drawn(prediction, batch), size)])
+    return stack([*pictures, comparison(batch, render_target(prediction, batch), size)])
 
 
 def comparison(batch: Batch, image: Tensor, size: tuple[int, int]) -> np.ndarray:
@@ -153,12 +155,12 @@ def main() -> None:
     for number, name in enumerate(data.subjects("val")):
         batch = data.evaluation_batch(name, views=4, targets=data.targets)
         prediction = model(batch)
-        image = drawn(prediction, batch)
+        image = render_target(prediction, batch)
         psnr = float(peak_signal_noise_ratio(image, batch.targets.images[0, 0], data_range=1.0))
         compared.append((psnr, comparison(batch, image, (220, 440))))
         print(f"{name}: {psnr:.2f} dB half-way", flush=True)
         if number == options.hero:
-            hero(batch, prediction, options.folder)
+            write_hero(batch, prediction, options.folder)
         if number in options.shown:
             results.append(result(batch, prediction))
     height = max(len(picture) for picture in results)

@@ -11,7 +11,7 @@ import torch
 from benchmarks import gpu
 from benchmarks.gpu_measure import DRY, Call, Rows, rehearsal
 from benchmarks.gpu_replay import WRONG, judge_optimizer, judge_prediction, judge_step
-from benchmarks.gpu_sections import SECTIONS, _capturing, _Step
+from benchmarks.gpu_sections import SECTIONS, _enable_capture, _Step
 from ghgs_lit.execution import Predictor
 from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.models import make_model
@@ -80,7 +80,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
         call = Call(device, rows, "step", TINY, tmp_path)
         if kind == "prediction":
             with torch.no_grad():
-                predictor = _capturing(call, Predictor(make_model("model=hull").eval().to(DEVICE)))
+                predictor = _enable_capture(call, Predictor(make_model("model=hull").eval().to(DEVICE)))
                 batch = dataclasses.replace(call.batch(1, 28), targets=None).to(DEVICE)
                 for _ in range(2):
                     predictor(batch)
@@ -88,7 +88,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
         else:
             step = _Step(call, call.run(*call.shipped), call.batch(1, 28))
             for _ in range(4):
-                step.captured()
+                step.run_captured()
             (judge_step if kind == "step" else judge_optimizer)(call, kind, step)
     [row] = rows.read()
     assert row["verdict"] == ("as eager" if planted is None else WRONG)

@@ -68,7 +68,7 @@ def count_launches(kind: str, size: int) -> Counts:
     model = two_rounds(kind)
     batch = ellipsoid_batch(0.15, 4, 28, size)
     batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=2.0 * batch.masks)
-    with pretend_device() as log, device.drawing_nothing():
+    with pretend_device() as log, device.render_nothing():
         model, batch = model.to(DEVICE), batch.to(DEVICE)
         for _ in range(2):  # the first fills caches, which depend only on the image size
             log.clear()
@@ -106,7 +106,7 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
     bodies = [torch.linspace(-0.3, 0.3, 3 * 40).view(40, 3)] * size
     weights = {"chamfer": 1.0} if kind == "model=paper" else {"depth": 0.2}
     losses = losses_of({"render_l1": 0.8, **weights})
-    with pretend_device() as log, device.drawing_nothing():
+    with pretend_device() as log, device.render_nothing():
         model = two_rounds(kind).to(DEVICE).train()
         captured = CapturedStep(Predictor(model), Renderer(), losses)
         captured.graphs, captured.predictor.graphs = (GraphCache(backend=SilentBackend()) for _ in range(2))
@@ -138,7 +138,7 @@ def test_little_is_asked_for_around_a_prediction_that_is_played_back(size):
     """Copies of inputs and results, the plan, buffers of renderings, and slicing of results to their
     size."""
     batch = dataclasses.replace(ellipsoid_batch(0.15, 4, 28, size), targets=None)
-    with pretend_device() as log, device.drawing_nothing():
+    with pretend_device() as log, device.render_nothing():
         predictor = Predictor.from_checkpoint(map_location=DEVICE)
         predictor.graphs = GraphCache(backend=SilentBackend())
         for _ in range(3):

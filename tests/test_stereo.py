@@ -106,10 +106,10 @@ def test_upsampled_maps_are_convex_combinations(stereo):
     maps = torch.rand(2, 1, 3, 5)
     weights = torch.zeros(2, 9, 16, 3, 5)
     weights[:, 4] = 1e4
-    found = stereo.upsampled(maps, weights.flatten(1, 2))
+    found = stereo.upsample(maps, weights.flatten(1, 2))
     assert torch.equal(found, F.interpolate(maps, scale_factor=4, mode="nearest")[:, 0])
     mean = F.avg_pool2d(F.pad(maps, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    found = stereo.upsampled(maps, torch.zeros(2, 144, 3, 5))
+    found = stereo.upsample(maps, torch.zeros(2, 144, 3, 5))
     torch.testing.assert_close(found, F.interpolate(mean, scale_factor=4, mode="nearest")[:, 0])
 
 
@@ -128,7 +128,7 @@ def test_gradients_are_those_of_finite_differences(stereo):
     maps = [torch.rand(1, n, 2, 1, dtype=torch.float64, requires_grad=True) for n in (2, 2, 1)]
     assert gradcheck(lambda *x: update(x[0], x[1], list(x[3:]), x[2]), (*maps, *levels))
     weights = torch.rand(1, 144, 2, 1, dtype=torch.float64, requires_grad=True)
-    assert gradcheck(stereo.upsampled, (maps[2], weights))
+    assert gradcheck(stereo.upsample, (maps[2], weights))
 
 
 @pytest.mark.parametrize("name", PEERS)

@@ -37,10 +37,10 @@ def measure_run(checkpoint: Path, directory: Path, pixels: float) -> None:
     method, facts = trained_method(run, torch.device("cpu"))
     error = Augmentation(calibration=pixels)
 
-    def knocked(batch: Batch) -> Batch:
+    def add_errors(batch: Batch) -> Batch:
         return error.add_imperfections(batch, [subject_rng(0, subject) for subject in batch.subjects])
 
-    methods = {"model": dataclasses.replace(method, cameras=knocked)}
+    methods = {"model": dataclasses.replace(method, cameras=add_errors)}
     data = inputs.build_data(run)
     facts |= {"verb": "evaluate", "checkpoint": str(checkpoint)}
     measure_and_write(methods, data, run, directory, torch.device("cpu"), **facts)

@@ -93,7 +93,7 @@ class Control(Recalibration):
         super().__init__(options, dim_latent)
         self.control = options.control
         # a hook, so that visualizations of attention use these features, too
-        self.register_forward_pre_hook(_with_parts)
+        self.register_forward_pre_hook(_insert_parts)
 
     def forward(self, tokens: Tokens, points: KnownPoints, plan) -> Tokens:
         """Recalibrate tokens, then change them as ``control`` specifies.
@@ -104,11 +104,11 @@ class Control(Recalibration):
             plan: as in :class:`Recalibration`.
         """
         tokens = super().forward(tokens, points, plan)
-        change = {"none": _unchanged, "shuffled": _shuffled, "residual": _with_residual}[self.control]
+        change = {"none": _keep, "shuffled": _shuffle, "residual": _insert_residual}[self.control]
         return change(tokens, points, self.takes_part(points))
 
 
-def _with_parts(stage: Control, inputs: tuple) -> tuple:
+def _insert_parts(stage: Control, inputs: tuple) -> tuple:
     """Inputs of the stage with part features."""
     tokens, points, plan = inputs
     expected = "kind: known, which tells this recalibration what is true"
@@ -116,11 +116,11 @@ def _with_parts(stage: Control, inputs: tuple) -> tuple:
     return dataclasses.replace(tokens, semantic=points.shares.sqrt()), points, plan
 
 
-def _unchanged(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
+def _keep(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
     return tokens
 
 
-def _shuffled(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
+def _shuffle(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
     """Permute the tokens of each subject, equally in all layers and all runs."""
     element = tokens.image // tokens.grid[1]
     order = torch.arange(len(element), device=element.device)
@@ -131,7 +131,7 @@ def _shuffled(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"
     return dataclasses.replace(tokens, latent=tuple(layer[order] for layer in tokens.latent))
 
 
-def _with_residual(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
+def _insert_residual(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
     """Replace the first channels of tokens by the true residual."""
     said = (points.residual / RESIDUAL_UNIT).repeat(1, COPIES)
     layers = []

@@ -116,7 +116,7 @@ class StereoHead(nn.Module):
         for _ in range(self.options.updates):
             memory, change = self.update(memory, context, levels, bounded_sigmoid(raw))
             raw = raw + change
-        return upsampled(bounded_sigmoid(raw), at_least_float32(self.weights(memory)))
+        return upsample(bounded_sigmoid(raw), at_least_float32(self.weights(memory)))
 
 
 def _most_cells(batch: Batch, count: int) -> int:
@@ -266,7 +266,7 @@ def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"])
     return torch.lerp(level.gather(1, low), level.gather(1, low + 1), at - low)
 
 
-def upsampled(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
+def upsample(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
     """Upsample maps to :data:`CELL` times their resolution.
 
     Each pixel is a convex combination of the 3 x 3 cells around its cell, with replicated borders

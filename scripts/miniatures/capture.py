@@ -30,7 +30,7 @@ def ring(count: int, radius: float, height: float, rng: np.random.Generator) -> 
     return np.stack((radii * np.sin(angles), heights, radii * np.cos(angles)), -1)
 
 
-def rigid(degrees: float, translation: np.ndarray) -> np.ndarray:
+def rigid_transform(degrees: float, translation: np.ndarray) -> np.ndarray:
     """A rigid transform [4, 4]: a rotation about the y axis, then a ``translation`` [3]."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
@@ -38,7 +38,7 @@ def rigid(degrees: float, translation: np.ndarray) -> np.ndarray:
     return pose
 
 
-def moved(person: Person, pose: np.ndarray) -> Person:
+def move_person(person: Person, pose: np.ndarray) -> Person:
     """``person`` in another frame: ``pose`` [4, 4] maps old to new coordinates."""
     return person.mapped(lambda vertices: vertices @ pose[:3, :3].T + pose[:3, 3])
 
@@ -48,7 +48,7 @@ def cameras_of(matrices: np.ndarray, poses: np.ndarray, height: int, width: int)
     return Cameras(*(torch.from_numpy(array).float() for array in (matrices, poses)), height, width)
 
 
-def before_wall(image: np.ndarray, mask: np.ndarray, brightness: float) -> np.ndarray:
+def add_background(image: np.ndarray, mask: np.ndarray, brightness: float) -> np.ndarray:
     """Compose an image [h, w, 3] in [0, 1] of a person with a studio, in [0, 255].
 
     The studio is a grey wall above a brown floor, so that unmasked background is visible.

@@ -76,11 +76,13 @@ def _write_sequence(
     from_world = torch.from_numpy(np.linalg.inv(to_world))
     _write_cameras(folder, cameras, from_world)
     for number in frames:
-        pose = capture.rigid(4.0 * number, np.array([0.05 * np.sin(number), 0, 0.05 * np.cos(number)]))
+        pose = capture.rigid_transform(
+            4.0 * number, np.array([0.05 * np.sin(number), 0, 0.05 * np.cos(number)])
+        )
         fit = parameters(*identity, person, to_world @ pose)
         (folder / "smpl_params").mkdir(exist_ok=True)
         np.savez(folder / "smpl_params" / f"{number:06d}.npz", **fit)
-        _write_frame(folder, number, capture.moved(person, pose), lights, cameras, manual)
+        _write_frame(folder, number, capture.move_person(person, pose), lights, cameras, manual)
 
 
 def _rig(scale: float, rng: np.random.Generator) -> Cameras:
@@ -114,7 +116,7 @@ def _write_frame(
 ) -> None:
     shots = Studio(person, lights, samples=1).shoot(cameras)
     for k in range(KINECTS):
-        image = capture.before_wall(shots.images[k], shots.masks[k], 0.9 + 0.02 * k)
+        image = capture.add_background(shots.images[k], shots.masks[k], 0.9 + 0.02 * k)
         hard = Image.fromarray(shots.masks[k].astype(np.uint8) * 255)
         written = {
             "kinect_color": image.astype(np.uint8),

@@ -71,15 +71,15 @@ def _write_sequence(
         listed.append({"ims": photographs})
         # The person turns and takes small steps.
         step = np.array([0.06 * np.sin(frame), 0, 0.06 * np.cos(2 * frame)])
-        pose = _Z_UP @ capture.rigid(35.0 * frame, stage + step)
-        posed = capture.moved(person, pose)
+        pose = _Z_UP @ capture.rigid_transform(35.0 * frame, stage + step)
+        posed = capture.move_person(person, pose)
         _write_body(folder, frame + 1 if old else frame, posed.body_vertices, pose, rng)
         studio = Studio(posed, lights, samples=1)
         half = matrices + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         shots = studio.shoot(capture.cameras_of(half, poses, size, size))
         for k, path in enumerate(photographs):
-            image = capture.before_wall(shots.images[k], shots.masks[k], 0.9 + 0.2 * k / len(names))
-            _write_photograph(folder, path, *_through_lens(image, shots.masks[k], grids[k]), k)
+            image = capture.add_background(shots.images[k], shots.masks[k], 0.9 + 0.2 * k / len(names))
+            _write_photograph(folder, path, *_distort(image, shots.masks[k], grids[k]), k)
     cams = {
         "K": list(matrices),
         "D": [lens.reshape(5, 1) for lens in lenses],
@@ -145,7 +145,7 @@ def _distorting_grid(matrix: np.ndarray, lens: np.ndarray, size: int) -> torch.T
     return ((2 * places + 1) / size - 1).reshape(1, size, size, 2).float()
 
 
-def _through_lens(image: np.ndarray, mask: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _distort(image: np.ndarray, mask: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     layers = torch.from_numpy(np.concatenate((image, 255.0 * mask[..., None]), -1)).float()
     bent = F.grid_sample(layers.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=False)
     bent = bent[0].permute(1, 2, 0).numpy()

@@ -29,7 +29,7 @@ def person():
 
 def test_each_trouble_comes_alone(script, person):
     """Each capture differs from the exact one by its trouble only; the last one has all of them."""
-    exact = script["photographed"](script["CAPTURES"]["clean"], person).photographs
+    exact = script["photograph"](script["CAPTURES"]["clean"], person).photographs
     for v, photograph in enumerate(exact):
         assert np.abs(photograph.matte / 255 - person.alpha[0, v].numpy()).max() < 1 / 255
         shown = person.images[0, v].movedim(0, -1).numpy() * 255
@@ -39,7 +39,7 @@ def test_each_trouble_comes_alone(script, person):
         assert torch.equal(torch.from_numpy(photograph.extrinsics).float(), person.cameras.extrinsics[0, v])
 
     def differs(name):
-        found = script["photographed"](script["CAPTURES"][name], person).photographs
+        found = script["photograph"](script["CAPTURES"][name], person).photographs
         parts = ("image", "matte", "intrinsics", "extrinsics")
         return {
             part
@@ -56,7 +56,7 @@ def test_each_trouble_comes_alone(script, person):
 
 def test_masks_are_whole_numbers_and_wrong_where_asked(script, person):
     exact, ragged, holed = (
-        np.stack([one.matte for one in script["photographed"](script["CAPTURES"][name], person).photographs])
+        np.stack([one.matte for one in script["photograph"](script["CAPTURES"][name], person).photographs])
         for name in ("masks in place of mattes", "masks off and ragged", "masks with holes")
     )
     assert all(set(np.unique(masks)) == {0, 255} for masks in (exact, ragged, holed))

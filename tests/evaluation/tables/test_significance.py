@@ -52,7 +52,7 @@ def test_the_interval_holds_the_difference():
 def test_tables_of_equal_rows_have_a_star_at_most_at_the_level(ratios, seeds):
     """Also where the deviations of rows differ by a factor of two."""
     trials = 150
-    marks, _ = table_power.tables([0] * len(ratios), ratios, seeds, "pooled", trials, 0.01)
+    marks, _ = table_power.sample_tables([0] * len(ratios), ratios, seeds, "pooled", trials, 0.01)
     assert marks.any(axis=1).sum() <= stats.binom.ppf(0.999, trials, table_power.ALPHA)
 
 
@@ -60,13 +60,13 @@ def test_a_pooled_variance_finds_what_pairs_of_rows_do_not():
     """With the paper's differences and three seeds; the smallest detectable difference is detected."""
     trials, alike = 100, [1] * 4
     pairs, pooled = (
-        table_power.tables(table_power.PAPER, alike, 3, way, trials)[0] for way in ("pairs", "pooled")
+        table_power.sample_tables(table_power.PAPER, alike, 3, way, trials)[0] for way in ("pairs", "pooled")
     )
     for before, after in zip(pairs.sum(axis=0), pooled.sum(axis=0), strict=True):
         counts = [[after, trials - after], [before, trials - before]]
         assert stats.fisher_exact(counts, alternative="greater").pvalue < 0.001
-    _, said = table_power.tables([0] * 4, alike, 3, "pooled", trials)
-    found = table_power.tables([0, said, 0, 0], alike, 3, "pooled", trials, start=1)[0][:, 0].sum()
+    _, said = table_power.sample_tables([0] * 4, alike, 3, "pooled", trials)
+    found = table_power.sample_tables([0, said, 0, 0], alike, 3, "pooled", trials, start=1)[0][:, 0].sum()
     assert found >= stats.binom.ppf(0.001, trials, POWER)
 
 
