@@ -49,8 +49,7 @@ OUTSIDE = ["os.system", "subprocess.run", "builtins.eval", "torch.load", "lightn
 
 
 def test_no_function_or_class_is_a_kind_by_its_path():
-    """Regression: ``_target_: ghgs_lit.runs.job._run_process`` with a command in a checkpoint executed
-    the command."""
+    """Regression: ``_target_`` with the path of a function in a checkpoint executed the function."""
     paths = [*everything_callable(), *OUTSIDE]
     assert len(paths) > 1500
     for number, path in enumerate(paths):  # a share for each group, foreign paths for all
@@ -83,7 +82,7 @@ def test_keys_of_hydras_instantiate_have_no_effect(group, tmp_path):
 def test_a_model_is_built_of_kinds_alone(stage):
     """The same holds for the nodes of a checkpoint."""
     settings = config()
-    settings[stage] = {"_target_": "ghgs_lit.runs.job._run_process", "command": ["false"]}
+    settings[stage] = {"_target_": "subprocess.run", "args": ["false"]}
     with pytest.raises(InputError, match=rf"{stage}\.kind: expected"):
         GHGS.from_config(settings)
 

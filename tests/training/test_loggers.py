@@ -251,7 +251,7 @@ def test_a_kill_loses_nothing_that_was_logged(tmp_path):
 def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
     """Resumed and moved runs keep their W&B id; another run in the same directory gets a new one."""
     seen = []
-    monkeypatch.setattr("ghgs_lit.training.loggers.installed", lambda *_: None)
+    monkeypatch.setattr("ghgs_lit.training.loggers.import_optional", lambda *_: None)
     monkeypatch.setattr("ghgs_lit.training.loggers.WandbLog", lambda **options: seen.append(options["id"]))
     config = run_of("train", ["seed=1", "resume=auto"])
     for folder, overwrite in (("a", False), ("a", False), ("b", False), ("b", True)):
