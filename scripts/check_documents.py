@@ -181,7 +181,7 @@ class Reader:
         self.folder = folder / document.replace("/", "_").removesuffix(".md")
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
-        for name in ("docs", "scripts", "benchmarks"):
+        for name in ("benchmarks", "docs", "examples", "scripts"):
             (self.folder / name).symlink_to(ROOT / name)
         programs = folder / "bin"
         programs.mkdir(exist_ok=True)

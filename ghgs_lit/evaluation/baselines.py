@@ -253,7 +253,7 @@ class PerScene:
     @property
     def fitting(self) -> Refinement:
         """Optimisation that fits the Gaussians."""
-        return Refinement(self.steps, self.renderer, CHANGES, detail=0)
+        return Refinement(self.steps, self.renderer, CHANGES)
 
     def begin(self, batch: Batch) -> Gaussians:
         """Initial Gaussians.
