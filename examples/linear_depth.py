@@ -13,7 +13,7 @@ from ghgs_lit.method.heads.depth import bounded_depth, finite_maps
 class LinearOptions(Options):
     """One depth for each patch, from its token alone."""
 
-    group = "depth_head"
+    group = "depth_head"  # in messages
     width: Width = 64
     """Channels of the hidden layer."""
 
@@ -33,4 +33,4 @@ class LinearHead(nn.Module):
         values = self.layers(maps).movedim(-1, 1).float()
         values = F.interpolate(values, batch.masks.shape[2:], mode="bilinear").view(batch.masks.shape)
         depth = bounded_depth(values, bounds.near, bounds.far, "bounded_inverse")
-        return finite_maps(depth, batch, torch.ones_like(depth), bounds)
+        return finite_maps(depth, batch, torch.ones_like(depth), bounds)  # 1: the confidence
