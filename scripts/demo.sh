@@ -18,8 +18,8 @@ hull="$(dirname "$(dirname "$(grep -lx -e '- model=hull' "$out"/*/.hydra/overrid
 cat <<TEXT
 
 Table:        $out/table/table.md
-              model=hull is told by the masks where depths are; within a box they take longer than a minute to
-              learn. The paper's ablation takes hours: "Reproduce the table" in README.md
+              model=hull bounds depths by the masks; within the box of model=paper they take longer than a
+              minute to learn. The paper's ablation takes hours: "Sweep, and reproduce the table" in README.md
 Pictures:     $out/*/pictures
 TensorBoard:  tensorboard --logdir $out
 Splat:        ghgs predict checkpoint=$hull/checkpoints/last.ckpt (of the model trained here)
