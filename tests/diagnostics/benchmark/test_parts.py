@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.cli.benchmark import broken_budgets
+from ghgs_lit.cli.benchmark import broken_budgets, make_rows
 from ghgs_lit.diagnostics.benchmark import measure
 from ghgs_lit.diagnostics.benchmark.cases import Case, combinations
 from ghgs_lit.diagnostics.benchmark.measure import (
@@ -79,6 +79,20 @@ def test_cases_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, mon
     for record in records:
         assert list(record.seconds) == [name for name in NAMES if name != ROUNDS]
         assert {len(seconds) for seconds in record.seconds.values()} == {2}
+
+
+def test_differences_are_the_worst_of_the_batches(model):
+    """A mean would hide a subject that a preset spoils."""
+    names = ("max_rel_diff", "rel_diff", "mse_to_none", "psnr_to_none", "unmatched")
+    batches = [
+        dict(zip(names, values, strict=True)) for values in ((0.1, 2, 1e-4, 40, 0), (0.3, 1, 1e-3, 30, 0.2))
+    ]
+    about = {"method": "model", "views": 3, "targets": "release", "subject": "a", "psnr": 30.0}
+    costs = [{"peak_bytes": 1.0}, {"peak_bytes": 3.0}]
+    record = Record(case(model, "none", Renderer()), costs, batches, [about], {TOTAL: [1.0]})
+    (row,) = make_rows([record])
+    assert row["differences"] == dict(zip(names, (0.3, 2, 1e-3, 30, 0.2), strict=True))
+    assert row["peak_bytes"] == 3
 
 
 def test_stages_and_the_rest_add_up_to_the_total(result, probe):
