@@ -39,7 +39,7 @@ CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
 TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1 data.render_workers=0"
 SHORT = "trainer.max_steps=2 trainer.val_check_interval=2 trainer.limit_val_batches=1"
 FEW = "--size 128 --train 2 --val 1"
-TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # beginning of the pattern of a training command
+TRAIN = r"^((?:\w+=\S+ )?ghgs train (?!.*(?:dry_run|-help))"  # beginning of the pattern of a training command
 # Pattern, replacement and reason.
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
