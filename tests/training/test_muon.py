@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.execution.graphs import GraphCache
-from ghgs_lit.training import Optimization, muon
+from ghgs_lit.training import Optimization
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalize
 from ghgs_lit.training.optimization import convert_rates_to_numbers, hold_rates
 from tests.helpers.capture_backends import OperatorBackend
@@ -36,32 +36,6 @@ def set_gradients(model, seed):
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         parameter.grad = torch.randn(parameter.shape, generator=generator)
-
-
-@pytest.mark.parametrize("kind", ["cpu", "gpu"])
-def test_padding_and_company_change_nothing(kind, monkeypatch):
-    """In float64, matrices of many shapes give the same result together as alone, with the padding of a CPU
-    and of a GPU."""
-    if kind == "gpu":
-        monkeypatch.setattr(muon, "_power_of_two", lambda count: 128)
-    muon._packing.cache_clear()
-    generator = torch.Generator().manual_seed(5)
-    shapes = [
-        (3, 3),
-        (5, 7),
-        (7, 5),
-        (16, 16),
-        (16, 576),
-        (17, 40),
-        (128, 64),
-        (64, 1176),
-        (130, 129),
-        (129, 130),
-    ]
-    several = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in shapes]
-    for matrix, found in zip(several, orthogonalize(several), strict=True):
-        torch.testing.assert_close(found, muon._orthogonalize_stack(matrix[None])[0], atol=1e-10, rtol=0)
-    muon._packing.cache_clear()
 
 
 def test_what_counts_as_a_matrix():
@@ -171,12 +145,9 @@ def take_steps(backend, capturable=True, steps=5):
         optimizer.step()
         for group in optimizer.param_groups if capturable else ():
             group["lr"].mul_(0.9)
-        assert {name for name, p in model.named_parameters() if p.grad is None} == MATRICES
+        assert all(parameter.grad is None for parameter in model.parameters())
     weights = [parameter.detach().cpu() for parameter in model.parameters()]
     return weights, backend and dict(optimizer.graphs.counts)
-
-
-MATRICES = {"conv", "square", "tall", "wide"}
 
 
 @pytest.mark.parametrize("capturable", [True, False])
