@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import itertools
 import os
 import shutil
 import subprocess
@@ -36,13 +35,10 @@ def _data(call: Call, train: int, active: int, val: int, *overrides: str) -> Pho
 def loader(call: Call) -> None:
     """Batches of eight for experiment=shipped from the loader"""
     numbers = call.rendered
-    for kept, workers in itertools.product((True, False), call.sizes.workers):
+    for workers in call.sizes.workers:
         options = ["data.batch_size=8", f"data.workers={workers}", "data.steps_per_epoch=100000"]
-        options += [] if kept else ["data.cache_images_mb=0"]
         found, samples = rate(_data(call, *numbers, *options), call.sizes.seconds)
-        photographs = "kept" if kept else "decoded anew"
-        name = f"{workers} workers, photographs {photographs}"
-        call.add(name, samples_s=found, ms_sample=1e3 / found, samples=samples)
+        call.add(f"{workers} workers", samples_s=found, ms_sample=1e3 / found, samples=samples)
 
 
 def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:

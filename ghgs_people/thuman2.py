@@ -8,10 +8,9 @@
 Renderings have the layout of :mod:`ghgs_lit.data.layout`; those of GPS-Gaussian, GHG, RoGSplat and the
 authors' release can be read without conversion."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -138,8 +137,6 @@ def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
 
 class THuman2(Scans):
     """THuman2.0, raw and rendered."""
-
-    published: ClassVar[Mapping[str, int]] = {"train": 426, "val": 100}
 
     name: Text = "thuman2"
     size: Size = 512

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from ghgs_lit.data.augmentation import Augmentation, Size
+from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import Sample, TrainingSampler
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
@@ -45,15 +45,11 @@ class TrainingBatches(Dataset):
     def __len__(self) -> int:
         return self.length
 
-    def sizes(self, step: int) -> tuple[Size, Size]:
-        """(height, width) in pixels of the inputs and of the targets at a step."""
-        fixed = self.photographs.size, self.photographs.target_size
-        step_of_class = step // self.sampler.class_steps
-        return self.augmentation.sample_sizes(*fixed, self.sampler.seed, step_of_class)
-
     def __getitem__(self, step: int) -> Batch:
         samples = self.sampler.batch(step, self.rank, self.world)
-        batch = self.photographs.batch(samples, self.sizes(step), self.depths, target_depths=False)
+        fixed = self.photographs.size, self.photographs.target_size
+        sizes = self.augmentation.sample_sizes(*fixed, self.sampler.seed, step)
+        batch = self.photographs.batch(samples, sizes, self.depths, target_depths=False)
         indices = self.sampler.indices(step, self.rank, self.world)
         return self.augmentation.augment(batch, self.sampler.seed, step, indices)
 

@@ -2,9 +2,10 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -15,19 +16,16 @@ from ghgs_lit.data.batches import make_loader
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.mask_checks import (
     SEARCH,
-    find_equal_poses,
     find_mask_problem,
     make_silhouette,
     measure_height,
     measure_overlap,
 )
-from ghgs_lit.data.reader import PHASES, Photographs, Reader
-from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
+from ghgs_lit.data.reader import PHASES, Reader
+from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, Photo
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
 
-# MiB of decoded files kept in memory, so that a body is read once for all images of its subject.
-_CACHE_MB = 4
 # A subject with all channels below this value, of 255, counts as black.
 _BLACK = 8
 # Height in metres above which another unit is likely.
@@ -37,43 +35,11 @@ _SHOWN = 30
 
 
 @dataclass
-class Reading:
-    """Result of reading one image.
-
-    Attributes:
-        name: name of the subject.
-        position: index of the camera.
-        view: number of the view at this position.
-        place: name of the image in messages.
-        problem: message about what is wrong; None: nothing.
-        has_body: whether the subject has a body.
-        iou: IoU of body and mask, in [0, 1] (:func:`measure_overlap`); None: no body to compare with.
-        agreement: share of the mask inside the visual hull of the subject's other masks; None if there is a
-            body to compare with.
-        tall: the subject's largest extent in world units, by its body or masks.
-        digest: digest of the image's pixels.
-        silhouette: coarse mask; None if there is a body to compare with.
-    """
-
-    name: str
-    position: int
-    view: int
-    place: str = ""
-    problem: str | None = None
-    has_body: bool = False
-    iou: float | None = None
-    agreement: float | None = None
-    tall: float | None = None
-    digest: str | None = None
-    silhouette: Silhouette | None = None
-
-
-@dataclass
 class Report:
     """Result of a check.
 
     Attributes:
-        phases: by phase, counts of what was read, and mean and minimum IoU and agreement.
+        phases: by phase, counts of what was read, and minimum IoU and agreement.
         problems: lines ``<place>: expected ...; found ...`` about what prevents training.
         notes: lines about what does not.
     """
@@ -97,48 +63,100 @@ class Report:
         path.write_text(json.dumps(vars(self), indent=1))
 
 
-@dataclass(frozen=True)
-class _Readings(Dataset):
-    """Dataset whose item ``i`` is the result of reading image ``i``."""
+@dataclass
+class SubjectReport:
+    """Result of reading one subject.
 
-    photographs: Photographs
-    listed: Sequence[tuple[str, int, int]]
+    Attributes:
+        name: name of the subject.
+        photos: number of its images, missing ones included.
+        problems: lines about what is wrong.
+        images: digest of the pixels and place of each image.
+        has_body: whether the subject has a body.
+        tall: largest extent in world units, of the body or else of the masks; 0: unknown.
+        iou: IoU of the body and each mask, in [0, 1]; empty without a body to compare with.
+        agreement: share of each mask inside the visual hull of the others; empty with such a body.
+    """
+
+    name: str
+    photos: int
+    problems: list[str] = field(default_factory=list)
+    images: list[tuple[str, str]] = field(default_factory=list)
+    has_body: bool = False
+    tall: float = 0.0
+    iou: list[float] = field(default_factory=list)
+    agreement: list[float] = field(default_factory=list)
+
+    def attempt(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function, and collect its InputError as a problem; returns its result, or None."""
+        try:
+            return function(*arguments)
+        except InputError as error:
+            self.problems.append(str(error))
+
+
+@dataclass(frozen=True)
+class _Subjects(Dataset):
+    """Dataset whose item ``i`` is the report about subject ``i``."""
+
+    reader: Reader
+    listed: Sequence[tuple[str, Sequence[Photo]]]
     min_iou: float
+    min_agreement: float
 
     def __len__(self) -> int:
         return len(self.listed)
 
-    def __getitem__(self, index: int) -> Reading:
-        reading = Reading(*self.listed[index])
-        try:
-            self._examine(reading)
-        except InputError as error:
-            reading.problem = str(error)
-        return reading
-
-    def _examine(self, reading: Reading) -> None:
-        """Read and measure an image; raises InputError if it is missing, broken or implausible."""
-        photograph = reading.name, reading.position, reading.view
-        view = self.photographs.view(*photograph)
-        body = self.photographs.body(reading.name)
-        place = reading.place = self.photographs.reader.place(*photograph)
-        reading.digest = hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest()
+    def __getitem__(self, index: int) -> SubjectReport:
+        name, photos = self.listed[index]
+        report = SubjectReport(name, len(photos))
+        body = report.attempt(self.reader.read_checked_body, name)
         if body is not None:
-            reading.has_body = True
-            reading.tall = float(np.ptp(body, axis=0).max())
-            reading.iou = measure_overlap(body, view)
-        problem = find_mask_problem(view.mask) if reading.iou is None else None
-        if reading.iou is not None and reading.iou < self.min_iou:
-            least = f"IoU of {self.min_iou:.2f} or more"
-            problem = f"expected the body in its mask ({least}); found IoU {reading.iou:.2f}"
+            report.has_body = True
+            report.tall = float(np.ptp(body, axis=0).max())
+        silhouettes = {}
+        for photo in photos:
+            silhouette = report.attempt(self._examine, report, photo, body)
+            if silhouette is not None:
+                silhouettes[photo] = silhouette
+        if len(silhouettes) > 1:
+            report.attempt(self._compare, report, silhouettes)
+        return report
+
+    def _examine(self, report: SubjectReport, photo: Photo, body: np.ndarray | None) -> Silhouette | None:
+        """Read an image and compare its mask with the body; returns its silhouette if that is impossible.
+        Raises InputError if the image is missing, broken or implausible."""
+        view = self.reader.read_checked_view(report.name, *photo, depth=True)
+        place = self.reader.place(report.name, *photo)
+        report.images.append((hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest(), place))
+        iou = None if body is None else measure_overlap(body, view)
+        if iou is None:
+            problem = find_mask_problem(view.mask)
+            if problem is not None:
+                raise InputError(f"{place}: {problem}")
+        else:
+            report.iou.append(iou)
+            expected = f"the body in its mask (IoU of {self.min_iou:.2f} or more)"
+            if iou < self.min_iou:
+                raise InputError(f"{place}: expected {expected}; found IoU {iou:.2f}")
         brightest = int(view.image[view.mask].max())
-        if problem is None and brightest < _BLACK:
+        if brightest < _BLACK:
             found = f"black (no channel above {brightest} of 255)"
-            problem = f"expected a photograph in the mask; found {found}"
-        if problem is not None:
-            raise InputError(f"{place}: {problem}")
-        if reading.iou is None:
-            reading.silhouette = make_silhouette(view)
+            raise InputError(f"{place}: expected a photograph in the mask; found {found}")
+        return make_silhouette(view) if iou is None else None
+
+    def _compare(self, report: SubjectReport, silhouettes: Mapping[Photo, Silhouette]) -> None:
+        """Compare the masks of a subject; raises InputError about the worst one."""
+        report.tall = report.tall or measure_height(list(silhouettes.values()))
+        report.agreement = SEARCH.shares(list(silhouettes.values()))
+        least = min(report.agreement)
+        if least < self.min_agreement:
+            worst = list(silhouettes)[report.agreement.index(least)]
+            raise InputError(
+                f"{self.reader.place(report.name, *worst)}: expected a mask that the others of its subject "
+                f"allow ({self.min_agreement:.0%} of it or more); found {least:.0%} (wrong axes, units, "
+                "direction or size of a camera?)"
+            )
 
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
@@ -154,7 +172,8 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
     dataset = data.dataset
     # Static cameras allow only one protocol.
     targets = CAMERAS if dataset.static_cameras else data.targets
-    readings: dict[str, list[Reading]] = {}
+    needed = {RING_VIEW} | targets.view_numbers
+    reports: dict[str, list[SubjectReport]] = {}
     for phase in PHASES:
         try:
             if phase == "train" and not dataset.has(phase):
@@ -165,15 +184,27 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
         except InputError as error:
             report.problems.append(str(error))
             continue
-        readings[phase] = _read(reader, targets, min_iou, data, f"checking {phase}")
-        _compare_masks(readings[phase], min_agreement)
-        report.phases[phase] = _summarize(reader, readings[phase])
-        report.problems += reader.problems + _collect(readings[phase], "problem")
-        report.notes += _describe_oddities(dataset.published.get(phase), phase, reader, readings[phase])
-    if len(readings) == len(PHASES):
-        report.problems += _find_leaks(str(dataset.root), *readings.values())
+        listed = []
+        for name, positions in reader.subjects.items():
+            photos = []
+            for position in positions:
+                photos += [(position, view) for view in sorted(needed.union(reader.views_at(name, position)))]
+            listed.append((name, photos))
+        reports[phase] = []
+        if listed:
+            items = _Subjects(reader, listed, min_iou, min_agreement)
+            loader = make_loader(items, min(data.workers(len(items)), len(items)))
+            console = Console(stderr=True)
+            reports[phase] += track(loader, f"checking {phase}", total=len(items), console=console)
+        report.phases[phase] = _summarize(reports[phase])
+        report.problems += reader.problems
+        for one in reports[phase]:
+            report.problems += one.problems
+        report.notes += _describe_oddities(phase, reports[phase])
+    if len(reports) == len(PHASES):
+        report.problems += _find_leaks(str(dataset.root), *reports.values())
     try:
-        if not report.problems and "train" in readings:
+        if not report.problems and "train" in reports:
             data.training_sampler(targets)
         if not report.problems:
             data.evaluation_loader(targets=targets)
@@ -183,107 +214,43 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
     return report
 
 
-def _read(
-    reader: Reader, targets: TargetProtocol, min_iou: float, data: PhotographsDataModule, label: str
-) -> list[Reading]:
-    """Read the images of a phase that exist or that a target protocol may require."""
-    needed = {RING_VIEW} | targets.view_numbers
-    listed = []
-    for name, positions in reader.subjects.items():
-        for position in positions:
-            views = sorted(needed | set(reader.views_at(name, position)))
-            listed += [(name, position, view) for view in views]
-    if not listed:
-        return []
-    photographs = Photographs(reader, None, min(data.dataset.cache_images_mb, _CACHE_MB))
-    items = _Readings(photographs, listed, min_iou)
-    loader = make_loader(items, min(data.workers(len(items)), len(items)))
-    return list(track(loader, label, total=len(items), console=Console(stderr=True)))
-
-
-def _compare_masks(readings: Sequence[Reading], least: float) -> None:
-    """Set the agreement and height of masks without a body; reports at most one problem a subject."""
-    by_subject: dict[str, list[Reading]] = {}
-    for one in readings:
-        if one.silhouette is not None:
-            by_subject.setdefault(one.name, []).append(one)
-    for several in by_subject.values():
-        ring = {one.position: one for one in several if one.view == RING_VIEW}
-        pair = find_equal_poses({position: one.silhouette.extrinsics for position, one in ring.items()})
-        if pair is not None:
-            twin = ring[pair[1]]
-            twin.problem = f"{twin.place}: expected a camera of its own; found that of position {pair[0]}"
-        elif len(several) > 1:
-            _compare_subject(several, least)
-
-
-def _compare_subject(readings: Sequence[Reading], least: float) -> None:
-    silhouettes = [one.silhouette for one in readings]
-    tall = measure_height(silhouettes)
-    for one, share in zip(readings, SEARCH.shares(silhouettes), strict=True):
-        one.agreement = share
-        one.tall = tall if one.tall is None else one.tall
-    worst = min(readings, key=lambda one: one.agreement)
-    if worst.agreement < least:
-        worst.problem = (
-            f"{worst.place}: expected a mask that the others of its subject allow ({least:.0%} of it or "
-            f"more); found {worst.agreement:.0%} (wrong axes, units, direction or size of a camera?)"
-        )
-
-
-def _collect(readings: Sequence[Reading], key: str) -> list:
-    """All known values of an attribute."""
-    return [value for one in readings if (value := getattr(one, key)) is not None]
-
-
-def _summarize(reader: Reader, readings: Sequence[Reading]) -> dict[str, float]:
+def _summarize(reports: Sequence[SubjectReport]) -> dict[str, float]:
     figures = {
-        "people": reader.people,
-        "subjects": len(reader.subjects),
-        "photos": len(readings),
-        "broken": len(_collect(readings, "problem")),
-        "bodies": len({one.name for one in readings if one.has_body}),
+        "subjects": len(reports),
+        "photos": sum(one.photos for one in reports),
+        "broken": sum(len(one.problems) for one in reports),
+        "bodies": sum(one.has_body for one in reports),
     }
     for key in ("iou", "agreement"):
-        if values := _collect(readings, key):
-            figures[f"mean {key}"] = round(float(np.mean(values)), 3)
+        values = [min(getattr(one, key)) for one in reports if getattr(one, key)]
+        if values:
             figures[f"least {key}"] = round(min(values), 3)
     return figures
 
 
-def _describe_oddities(
-    published: int | None, phase: str, reader: Reader, readings: Sequence[Reading]
-) -> list[str]:
-    subjects = reader.subjects
-    bodies = len({one.name for one in readings if one.has_body})
+def _describe_oddities(phase: str, reports: Sequence[SubjectReport]) -> list[str]:
     notes = []
-    if published not in (None, reader.people):
-        notes.append(f"{phase}: expected {published} people as published; found {reader.people}")
-    if bodies < len(subjects):
+    bodies = sum(one.has_body for one in reports)
+    if bodies < len(reports):
         notes.append(
-            f"{phase}: expected a body for each of {len(subjects)} subjects; found "
+            f"{phase}: expected a body for each of {len(reports)} subjects; found "
             f"{bodies} (no Chamfer term; cameras are checked by their masks alone)"
         )
-    tall = np.median(_collect(readings, "tall") or [0.0])
+    tall = np.median([one.tall for one in reports if one.tall] or [0.0])
     if tall > _TALLEST:
         notes.append(f"{phase}: expected metres; found subjects {tall:.0f} units tall (millimetres?)")
-    most = max(map(len, subjects.values()), default=0)
-    fewer = [name for name, positions in subjects.items() if len(positions) < most]
-    if fewer:
-        found = f"fewer of {len(fewer)}, as {fewer[0]}"
-        notes.append(f"{phase}: expected {most} cameras of every subject; found {found}")
     return notes
 
 
-def _find_leaks(root: str, train: Sequence[Reading], val: Sequence[Reading]) -> list[str]:
+def _find_leaks(root: str, train: Sequence[SubjectReport], val: Sequence[SubjectReport]) -> list[str]:
     """Find subjects, or equal images under different names, that are in both ``train`` and ``val``."""
     both = sorted({one.name for one in train} & {one.name for one in val})
     lines = [f"{root}: expected each subject in train or in val; found {name!r} in both" for name in both]
-    trained = {one.digest: one for one in train if one.digest is not None}
-    repeated: dict[tuple[str, str], str] = {}
+    trained = {}
+    for one in train:
+        trained |= one.images
     for one in val:
-        twin = trained.get(one.digest)
+        twin = next(((place, trained[digest]) for digest, place in one.images if digest in trained), None)
         if twin is not None and one.name not in both:
-            line = f"{one.place}: expected a photograph that train has not; found {twin.place}"
-            repeated.setdefault((one.name, twin.name), line)
-    return lines + list(repeated.values())
+            lines.append(f"{twin[0]}: expected a photograph that train has not; found {twin[1]}")
+    return lines

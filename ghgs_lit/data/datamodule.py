@@ -131,7 +131,7 @@ class PhotographsDataModule(LightningDataModule):
         require_choice("split", phase, self.dataset.split_names)
         if phase not in self._photographs:
             data = self.dataset
-            options = data.size, data.cache_images_mb, data.resampling, data.target_size
+            options = data.size, data.resampling, data.target_size
             self._photographs[phase] = Photographs(data.reader(phase), *options)
         return self._photographs[phase]
 
@@ -147,8 +147,7 @@ class PhotographsDataModule(LightningDataModule):
         """
         data = self.dataset
         protocols = (self.views, self._check_static(targets or self.targets))
-        numbers = (data.ring, data.batch_size, self.seed, data.class_steps)
-        return TrainingSampler(self.subjects("train"), *protocols, *numbers)
+        return TrainingSampler(self.subjects("train"), *protocols, data.ring, data.batch_size, self.seed)
 
     def training_batch(self, step: int) -> Batch:
         """The training batch at ``step`` in a run with a single process."""

@@ -50,13 +50,11 @@ class DataOptions(Options):
     """Base class for options of data sets, which builds the data module.
 
     Attributes:
-        published: number of people of each phase in the publication, if any.
         static_cameras: whether the data has no views between the cameras (all view numbers are 0).
         ring: number of positions of a full ring of cameras, on which inputs are evenly spaced.
     """
 
     group = "data"
-    published: ClassVar[Mapping[str, int]] = {}
     static_cameras: ClassVar[bool] = False
     ring: ClassVar[int] = 16
 
@@ -71,14 +69,8 @@ class DataOptions(Options):
     code (Pillow's bicubic filter for images, OpenCV's nearest neighbour for masks)."""
     batch_size: int = Field(1, ge=1, le=1024)
     """Samples of a step in each process, all in memory at once; at most 1024."""
-    class_steps: Count = 1
-    """Number of consecutive training batches with equal image and target sizes, number of views, entry of
-    token_budgets and number of rounds. The CUDA graph captured in the first two is replayed in the
-    others."""
     steps_per_epoch: Count | None = None
     """Training steps of an epoch; null: whole passes over the subjects, at least 100 steps."""
-    cache_images_mb: Amount = 512
-    """Memory in MiB in which each process caches decoded images."""
     packed_gb: Amount = 16
     """Maximum size in GB (10^9 bytes) of decoded training images on disk, in the data's folder or the
     user's cache, from which they are memory-mapped; 0: none."""

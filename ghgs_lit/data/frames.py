@@ -159,10 +159,6 @@ class FrameReader(Reader):
         """Files on which a frame's body depends, first the frame's own file."""
         return ()
 
-    @property
-    def people(self) -> int:
-        return len({frame.folder for frame in self.frames.values()})
-
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """Read an image on black, see :meth:`Reader.read_view`. There are no views between cameras and no
         depth maps: ``view`` and ``depth`` are not used."""

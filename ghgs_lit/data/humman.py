@@ -13,7 +13,6 @@
 
 import logging
 import re
-from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
@@ -129,7 +128,6 @@ class SequenceNames(Options):
 class HuMMan(DataSet):
     """Downloaded HuMMan-Recon sequences below ``root``; each frame of a sequence is a subject."""
 
-    published: ClassVar[Mapping[str, int]] = {"train": 317, "val": 22}
     static_cameras: ClassVar[bool] = True
     ring: ClassVar[int] = len(KINECTS)
 

@@ -1,13 +1,12 @@
 """Readers of images by subject, position and view.
 
-A data set implements a :class:`Reader`, which finds and decodes its files. Resizing, caching and
-batching (:class:`Photographs`), as well as sampling, are the same for all data sets.
+A data set implements a :class:`Reader`, which finds and decodes its files. Resizing and batching
+(:class:`Photographs`), as well as sampling, are the same for all data sets.
 """
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ import torch
 from ghgs_lit.data.decoding import check_array, check_view
 from ghgs_lit.data.sampling import Photo, Sample, photo_name
 from ghgs_lit.data.view import View, resize_view
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 from ghgs_lit.types import Batch, Cameras, Targets
 
 if TYPE_CHECKING:
@@ -63,11 +62,6 @@ class Reader(ABC):
     def read_body(self, name: str) -> np.ndarray | None:
         """Read the body's vertices [n, 3] float32 in the world, metres; None if the data has none."""
 
-    @property
-    def people(self) -> int:
-        """Number of people, less than that of subjects if a subject is one frame of a person."""
-        return len(self.subjects)
-
     def views_at(self, name: str, position: int) -> list[int]:
         """Numbers of the views of a subject that exist at a position."""
         return [0]
@@ -104,6 +98,17 @@ class Reader(ABC):
             raise InputError(f"{place}: expected a subject in the mask; found none")
         return stored
 
+    def read_checked_body(self, name: str) -> np.ndarray | None:
+        """Read a body with :meth:`read_body`, and check it.
+
+        Raises:
+            InputError: it is not an array [n, 3] of finite numbers.
+        """
+        vertices = self.read_body(name)
+        if vertices is not None:
+            check_array(f"{name}: body", vertices, [(None, 3)])
+        return vertices
+
     @contextlib.contextmanager
     def collect_problems(self) -> Iterator[None]:
         """Context that collects an InputError in ``problems``, or raises it if the reader is strict."""
@@ -128,37 +133,29 @@ class Reader(ABC):
 
 
 class Photographs:
-    """Images of a reader: resizes them, caches them in memory, and collates them into batches.
+    """Images of a reader: resizes them and collates them into batches.
 
     Args:
         size: (height, width) of the inputs in pixels; None: as stored.
-        cache_mb: MiB of decoded views and bodies cached in each process, at least 0; the least recently
-            used are dropped first.
         resampling: see :func:`ghgs_lit.data.view.resize_view`.
         target_size: (height, width) of the targets in pixels; None: same as the inputs.
 
     Attributes:
         packs: packed files by the size of their images; they take precedence over the reader.
-        cached_bytes: size of the cached views and bodies.
     """
 
     def __init__(
         self,
         reader: Reader,
         size: Size | None = None,
-        cache_mb: float = 0,
         resampling: str = "area",
         target_size: Size | None = None,
     ) -> None:
-        require(cache_mb >= 0, "data.cache_images_mb", "at least 0", cache_mb)
         self.reader = reader
         self.size = size
         self.target_size = target_size or size
         self.resampling = resampling
         self.packs: Mapping[Size | None, Packs] = {}
-        self.cached_bytes = 0
-        self.cache_bytes = int(cache_mb * 2**20)
-        self._cache: OrderedDict[tuple, View | np.ndarray | None] = OrderedDict()
 
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: Size | None = None
@@ -176,43 +173,10 @@ class Photographs:
         """
         size = size or self.size
         packs = self.packs.get(size) or self.packs.get(None)
-        packed = packs.view(name, position, view, depth) if packs else None
-        if packed is not None:
-            return resize_view(packed, size, self.resampling)
-
-        def read() -> View:
+        stored = packs.view(name, position, view, depth) if packs else None
+        if stored is None:
             stored = self.reader.read_checked_view(name, position, view, depth)
-            return resize_view(stored, size, self.resampling)
-
-        return self._read_cached((name, position, view, depth, size), read)
-
-    def body(self, name: str) -> np.ndarray | None:
-        """Read and check a subject's body, see :meth:`Reader.read_body`.
-
-        Raises:
-            InputError: it is not an array [n, 3] of finite numbers.
-        """
-
-        def read() -> np.ndarray | None:
-            vertices = self.reader.read_body(name)
-            if vertices is not None:
-                check_array(f"{name}: body", vertices, [(None, 3)])
-            return vertices
-
-        return self._read_cached((name,), read)
-
-    def _read_cached(self, key: tuple, read: Callable[[], Any]) -> Any:
-        if key in self._cache:
-            self._cache.move_to_end(key)
-            return self._cache[key]
-        value = read()
-        nbytes = getattr(value, "nbytes", 0)
-        if nbytes <= self.cache_bytes:
-            self._cache[key] = value
-            self.cached_bytes += nbytes
-            while self.cached_bytes > self.cache_bytes:
-                self.cached_bytes -= getattr(self._cache.popitem(last=False)[1], "nbytes", 0)
-        return value
+        return resize_view(stored, size, self.resampling)
 
     def batch(
         self,
@@ -235,7 +199,7 @@ class Photographs:
         size, target_size = sizes or (self.size, self.target_size)
         photos = [(sample.subject, sample.inputs) for sample in samples]
         maps, names = self._collate(photos, depths, size, with_alpha=True)
-        bodies = [self.body(sample.subject) for sample in samples]
+        bodies = [self.reader.read_checked_body(sample.subject) for sample in samples]
         has_bodies = all(body is not None for body in bodies)
         targets = None
         if samples[0].targets:

@@ -222,7 +222,6 @@ class TrainingSampler:
         subjects: camera positions of each subject.
         ring: number of positions of a full ring.
         batch_size: samples per step and process.
-        class_steps: number of consecutive steps with equal numbers of inputs.
 
     Raises:
         InputError: a subject has too few positions.
@@ -234,7 +233,6 @@ class TrainingSampler:
     ring: int
     batch_size: int
     seed: int
-    class_steps: int = 1
 
     def __post_init__(self) -> None:
         most = max(self.views.training_counts)
@@ -250,8 +248,7 @@ class TrainingSampler:
 
     def batch(self, step: int, rank: int = 0, world: int = 1) -> list[Sample]:
         """Samples of one process at a step, with equal numbers of inputs."""
-        numbers = [self.seed, _COUNT, step // self.class_steps]
-        count = int(np.random.default_rng(numbers).choice(self.views.training_counts))
+        count = int(np.random.default_rng([self.seed, _COUNT, step]).choice(self.views.training_counts))
         return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
 
     def indices(self, step: int, rank: int = 0, world: int = 1) -> range:

@@ -163,11 +163,6 @@ class View:
         return None if self.inverse_depth is None else _depths()[self.inverse_depth]
 
     @property
-    def nbytes(self) -> int:
-        maps = (self.image, self.mask, self.inverse_depth, self.matte)
-        return sum(map_.nbytes for map_ in maps if map_ is not None) + 1024
-
-    @property
     def alpha(self) -> np.ndarray | None:
         """Matte [h, w] float32 in [0, 1]."""
         return None if self.matte is None else np.divide(self.matte, 255, dtype=np.float32)

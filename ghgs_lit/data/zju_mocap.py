@@ -201,7 +201,6 @@ class FramesByPhase(Options):
 class ZJUMoCap(DataSet):
     """Downloaded ZJU-MoCap sequences below ``root``; each frame of a sequence is a subject."""
 
-    published: ClassVar[Mapping[str, int]] = {"train": 6, "val": 3}
     static_cameras: ClassVar[bool] = True
 
     name: Text = "zju_mocap"

@@ -89,12 +89,6 @@ class BudgetedModule(L.LightningModule):
         part = batch_idx % self.trainer.accumulate_grad_batches
         return [self.config.get("seed", 0), self.global_step, part]
 
-    def shared_numbers(self, batch_idx: int) -> list[int] | None:
-        """Seed for choices that ``data.class_steps`` consecutive batches share; None if that is 1."""
-        steps = (self.config.get("data") or {}).get("class_steps", 1)
-        seed, step, part = self.step_numbers(batch_idx)
-        return None if steps == 1 else [seed, (step * self.trainer.accumulate_grad_batches + part) // steps]
-
     def progress(self) -> float:
         """Used share of the budget of steps or of time, whichever is larger.
 

@@ -39,13 +39,11 @@ class Step:
         batch: the batch of this process.
         seed: seed of all random numbers of the step.
         budget: which patches the encoder processes (:func:`~ghgs_lit.training.module.sample_budget`);
-            None: as configured.
-        rounds: number of rounds; None: sampled with the seed."""
+            None: as configured."""
 
     batch: Batch
     seed: int
     budget: str | int | None = None
-    rounds: int | None = None
 
 
 class _FirstFault(Watcher):

@@ -19,7 +19,6 @@ from ghgs_lit.losses import Losses
 from ghgs_lit.method.heads.inspection import collect_attributes, offsets_at_limit
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan.presets import KeptTokens, keep_patches
-from ghgs_lit.method.rounds import Rounds
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.guard import Guard, Step
@@ -32,7 +31,7 @@ Choice = TypeVar("Choice")
 VALIDATED = ("psnr", "psnr_box", "ssim", "lpips", *FURTHER, "psnr_edge")
 
 
-def sample_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int = 1) -> Choice:
+def sample_budget(budgets: Sequence[Choice], numbers: Sequence[int]) -> Choice:
     """Sample which patches the encoder processes in a training step.
 
     Args:
@@ -40,12 +39,11 @@ def sample_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int
             rectangle around the subject (``balanced``); a number: the subject's patches and those at
             most this many patches away (``fast``). A budget listed twice is sampled twice as often.
         numbers: seed; equal numbers give the same budget.
-        stream: selects an independent stream of samples for the same seed.
 
     Returns:
         One of the budgets."""
     # A key of its own, as the same numbers also seed other samples of the step.
-    generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(stream,)))
+    generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(1,)))
     return budgets[int(generator.integers(len(budgets)))]
 
 
@@ -55,14 +53,6 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
     Args:
         budget: see :func:`sample_budget`; None: as the model is configured."""
     return nullcontext() if budget is None else keep_patches(model.encoder, KeptTokens.of_budget(budget))
-
-
-def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[None]:
-    """Context in which the model predicts with a given number of rounds.
-
-    Args:
-        count: number of rounds; None: each prediction samples one."""
-    return nullcontext() if count is None else model.rounds.fix_count(count)
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -157,7 +147,7 @@ class GHGSModule(BudgetedModule):
         Returns:
             The prediction, the scalar loss, and the unweighted terms of the loss by name."""
         torch.manual_seed(step.seed)
-        with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
+        with token_budget(self.model, step.budget):
             prediction, rendering = self(step.batch)
         total, values = self.losses(prediction, rendering, step.batch)
         return prediction, total, values
@@ -175,19 +165,16 @@ class GHGSModule(BudgetedModule):
             return None
         scale = None if scaler is None else scaler.scale(torch.ones((), device=self.device))
         torch.manual_seed(step.seed)
-        with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
+        with token_budget(self.model, step.budget):
             return captured(step.batch, scale)
 
     def _make_step(self, batch: Batch, batch_idx: int) -> Step:
         """Assemble all inputs of a training step."""
-        budget = count = None
-        shared = self.shared_numbers(batch_idx)
+        budget = None
         # Equal in all processes, so that none waits for another.
         if self.token_budgets is not None:
-            budget = sample_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
-        if shared and isinstance(getattr(self.model, "rounds", None), Rounds):
-            count = sample_budget(self.model.rounds.options.training_counts, shared, stream=2)
-        return Step(batch, self.step_seed(batch_idx), budget, count)
+            budget = sample_budget(self.token_budgets, self.step_numbers(batch_idx))
+        return Step(batch, self.step_seed(batch_idx), budget)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Run the forward pass of a step on a batch with targets and log its loss, without a

@@ -102,7 +102,7 @@ UNLIMITED = {
     "how seldom something comes": """
         every every_n_train_steps log_every_n_steps val_check_interval exact_from""",
     "the end of a run or epoch comes first, or Ctrl-C": """
-        max_steps fast_dev_run class_steps steps_per_epoch accumulate_grad_batches skip_nonfinite""",
+        max_steps fast_dev_run steps_per_epoch accumulate_grad_batches skip_nonfinite""",
     "of a list": "devices",
 }
 

@@ -76,16 +76,6 @@ def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
     assert changed[0] == changed[1] != changed[2]
 
 
-def test_sizes_of_a_class_are_drawn_once(boxes):
-    varied = {"sizes": [28, 42], "target_scale": [0.7, 1.0]}
-    sizes = [
-        [data.training_batches(6).sizes(step) for step in range(6)]
-        for data in (module(boxes, augmentation=varied, class_steps=steps) for steps in (1, 3))
-    ]
-    assert sizes[1] == [sizes[0][0]] * 3 + [sizes[0][1]] * 3
-    assert len(set(sizes[0])) > 2
-
-
 def test_sizes_are_drawn_for_a_step_and_cameras_follow(boxes):
     """Every size occurs, equal in all processes, and targets are 0.7 to 2 times as large."""
     data = module(

@@ -280,7 +280,10 @@ def read_all(kind: str, root: Path) -> list:
     """Read everything of the frame that training or evaluation reads."""
     settings = ("train", ("data.size=64",)) if kind == "zju_mocap" else ("val", ())
     photographs = stored(build_data(kind, root, *settings[1]), settings[0])
-    return [(name, photographs.view(name, 0), photographs.body(name)) for name in photographs.reader.subjects]
+    return [
+        (name, photographs.view(name, 0), photographs.reader.read_checked_body(name))
+        for name in photographs.reader.subjects
+    ]
 
 
 @pytest.mark.parametrize(("kind", "size"), [("zju_mocap", (64, 64)), ("humman", (72, 128))])

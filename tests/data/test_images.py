@@ -285,7 +285,7 @@ def test_bodies_with_nan_are_refused():
     """A single NaN vertex would make the whole Chamfer loss NaN."""
     body = np.zeros((5, 3), np.float32)
     body[2, 1] = np.nan
-    refused("a: body: expected finite numbers", lambda: Photographs(OneView(SOUND, body)).body("a"))
+    refused("a: body: expected finite numbers", lambda: OneView(SOUND, body).read_checked_body("a"))
 
 
 @pytest.mark.parametrize("number", [10**400, float("inf"), float("nan"), "inf", None, True + 0j])

@@ -40,8 +40,8 @@ def write_person(root, name="box", size=SIZE, positions=(0, 4)) -> dict:
     return written
 
 
-def photographs(root, size=None, cache_mb=0, **options) -> Photographs:
-    return Photographs(Layout(root, "train", **options), size, cache_mb)
+def photographs(root, size=None, **options) -> Photographs:
+    return Photographs(Layout(root, "train", **options), size)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_names_of_other_systems(tmp_path):
     found = layout.view("K\u00e4the", 4, 0)
     for name in ("image", "mask", "inverse_depth", "matte", "intrinsics", "extrinsics"):
         np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
-    assert layout.body("K\u00e4the").shape == (8, 3)
+    assert layout.reader.read_checked_body("K\u00e4the").shape == (8, 3)
     assert photographs(tmp_path, names=["K\u00e4the"]).reader.subjects == {"K\u00e4the": (0, 4)}
 
 
@@ -87,7 +87,7 @@ def test_round_trip(box):
     layout = photographs(folder)
     assert layout.reader.subjects == {"box": (0, 4)}
     person = RIG.place(box_person(), subject_rng(0, "box"))
-    np.testing.assert_array_equal(layout.body("box"), person.body_vertices)
+    np.testing.assert_array_equal(layout.reader.read_checked_body("box"), person.body_vertices)
     for position, (shots, cameras) in written.items():
         view = layout.view("box", position, 0)
         assert np.abs(view.image / 255 - shots.images[0]).max() < 0.06
@@ -148,7 +148,7 @@ def test_renders_of_others_are_read(root):
     np.testing.assert_array_equal(view.extrinsics, ours.extrinsics)
     assert view.depth is None
     assert layout.reader.views_at("box", 0) == [0]
-    assert len(layout.body("box")) == 8
+    assert len(layout.reader.read_checked_body("box")) == 8
     np.testing.assert_allclose(view.intrinsics[:2, 2], ours.intrinsics[:2, 2] + 0.5, rtol=1e-6)
     half = photographs(root, (28, 28), pixel_centers="integer").view("box", 0, 0)
     np.testing.assert_allclose(half.intrinsics[:2, 2], (ours.intrinsics[:2, 2] + 0.5) / 2, rtol=1e-6)
@@ -186,19 +186,6 @@ def test_data_without_mattes_is_read_as_before(root):
     share = plain.mask.reshape(28, 2, 28, 2).mean((1, 3))
     np.testing.assert_array_equal(small.mask, share >= 0.5)
     np.testing.assert_array_equal(small.depth > 0, small.mask)
-
-
-def test_cache_keeps_what_fits_and_no_more(root):
-    """The cache respects its limit and drops the least recently used first."""
-    layout = photographs(root, cache_mb=2 * (SIZE * SIZE * 7 + 1024) / 2**20)
-    first = layout.view("box", 0, 0)
-    assert layout.view("box", 0, 0) is first
-    layout.view("box", 4, 0)
-    layout.body("box")  # a third entry: the oldest one is dropped
-    assert layout.view("box", 0, 0) is not first
-    assert layout.cached_bytes <= layout.cache_bytes
-    nothing = photographs(root)
-    assert nothing.view("box", 0, 0) is not nothing.view("box", 0, 0)
 
 
 def picture(kind: str, array, suffix: str = "png"):
@@ -277,7 +264,7 @@ def test_bad_files_are_named(root, damage, line):
 )
 def test_bodies_of_no_person_are_named(root, vertices, message):
     np.save(root / "train" / "smpl" / "box" / "vertices.npy", vertices)
-    refused(rf"box/vertices\.npy: {message}", lambda: photographs(root).body("box"))
+    refused(rf"box/vertices\.npy: {message}", lambda: photographs(root).reader.read_checked_body("box"))
 
 
 @pytest.mark.parametrize(

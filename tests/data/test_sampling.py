@@ -334,18 +334,6 @@ def test_training_samples_depend_on_seed_step_and_index_only():
     assert forward[7] == sampler().batch(7)
 
 
-def test_batches_of_a_class_have_one_number_of_inputs():
-    """Consecutive batches share the number of inputs, with different subjects and cameras, and all numbers
-    occur."""
-    batches = [sampler(class_steps=8).batch(step) for step in range(160)]
-    counts = [len(batch[0].inputs) for batch in batches]
-    assert all(len(set(counts[first : first + 8])) == 1 for first in range(0, 160, 8))
-    assert set(counts) == {3, 4, 5}
-    assert len({batch[0].inputs for batch in batches[:8]}) == 8
-    once = [len(sampler().batch(step)[0].inputs) for step in range(20)]
-    assert counts[::8] == once
-
-
 def test_training_samples_are_fair():
     """Each epoch has every subject once; all counts, positions and views occur, and no target is an input."""
     batches = [sampler().batch(step) for step in range(300)]

@@ -39,7 +39,11 @@ def test_bodies_project_into_every_mask(zju_root):
     """Cameras, bodies and masks of both generations agree, after undistortion."""
     for sequence in ("386", "313"):
         data = of_zju(zju_root, sequence, cameras=None, masks=BOTH)
-        shares = [inside(data.view(n, k), data.body(n)) for n, ks in data.reader.subjects.items() for k in ks]
+        shares = [
+            inside(data.view(n, k), data.reader.read_checked_body(n))
+            for n, ks in data.reader.subjects.items()
+            for k in ks
+        ]
         assert len(shares) == 2 * (21 if sequence == "313" else 23)
         assert min(shares) > 0.99
 
@@ -97,7 +101,7 @@ def test_old_sequences_count_frames_from_one(zju_root):
     assert list(data.reader.subjects) == ["CoreView_313_000001", "CoreView_313_000002"]
     assert not (zju_root / "CoreView_313" / "new_vertices" / "0.npy").exists()
     stored = np.load(zju_root / "CoreView_313" / "new_vertices" / "1.npy")
-    np.testing.assert_array_equal(data.body("CoreView_313_000001"), stored)
+    np.testing.assert_array_equal(data.reader.read_checked_body("CoreView_313_000001"), stored)
     assert list(of_zju(zju_root).reader.subjects) == ["CoreView_386_000000", "CoreView_386_000001"]
 
 
@@ -159,11 +163,11 @@ def test_the_new_fit_is_preferred(zju_root, tmp_path):
     old = np.load(zju_root / "CoreView_386" / "vertices" / "0.npy")
     assert new.shape == (6890, 3)
     assert np.abs(new - old).max() > 0.002
-    np.testing.assert_array_equal(of_zju(zju_root).body("CoreView_386_000000"), new)
+    np.testing.assert_array_equal(of_zju(zju_root).reader.read_checked_body("CoreView_386_000000"), new)
     shutil.rmtree(tmp_path / "CoreView_386" / "new_vertices")
-    np.testing.assert_array_equal(of_zju(tmp_path).body("CoreView_386_000000"), old)
+    np.testing.assert_array_equal(of_zju(tmp_path).reader.read_checked_body("CoreView_386_000000"), old)
     shutil.rmtree(tmp_path / "CoreView_386" / "vertices")
-    assert of_zju(tmp_path).body("CoreView_386_000000") is None
+    assert of_zju(tmp_path).reader.read_checked_body("CoreView_386_000000") is None
 
 
 def test_frames_are_places_in_the_annotations(zju_root):
@@ -182,18 +186,15 @@ def test_the_default_split_is_sherfs(zju_root):
     assert [s.sequences for s in val] == [("377", "313", "315")]
     assert len(range(*train[0].frames)) == 100
     assert list(range(*val[0].frames)) == list(range(0, 500, 20))
-    assert data.published == {"train": 6, "val": 3}
 
 
 def test_batches_have_the_protocols_cameras(zju_root):
-    """For 3 views inputs are 0 7 15 and targets all 17 other cameras; frames of a person count as one
-    person."""
+    """For 3 views inputs are 0 7 15 and targets all 17 other cameras."""
     data = build_data("zju_mocap", zju_root, "data.size=64", "data.workers=0", "views=v3")
     batch = data.training_batch(0)
     assert batch.images.shape == (1, 3, 3, 64, 64)
     assert batch.targets.images.shape == (1, 1, 3, 64, 64)
     assert batch.body_vertices[0].shape == (6890, 3)
-    assert [data.dataset.reader(phase).people for phase in ("train", "val")] == [1, 1]
     samples = list(data.evaluation_loader(views=3))
     assert samples[0].views == (("000/0", "007/0", "015/0"),)
     assert [len(names) for sample in samples for names in sample.targets.names] == [17]
@@ -260,7 +261,6 @@ def test_named_sequences_are_for_testing_and_the_rest_for_training(humman_root, 
     assert len(data.split.val) == len(set(data.split.val)) == 22
     assert data.sequences("train") == ["p100001_a000048"]
     assert {frame.folder.name for frame in data.reader("val").frames.values()} == {HUMMAN}
-    assert data.published == {"train": 317, "val": 22}
     assert list(range(*data.frames)) == [6 * i for i in range(17)]
 
 
@@ -281,14 +281,14 @@ def test_drawn_masks_are_read_where_there_are_any(humman_root):
 
 def test_no_body_is_a_choice(humman_root):
     """Without a body model, ``body_vertices`` of batches is None, for training without the Chamfer loss."""
-    assert of_humman(humman_root).body(f"{HUMMAN}_000000") is None
+    assert of_humman(humman_root).reader.read_checked_body(f"{HUMMAN}_000000") is None
     batch = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0").training_batch(0)
     assert batch.body_vertices is None
     assert batch.images.shape == (1, 4, 3, 36, 64)
 
 
 def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(humman_root):
-    """The documented protocol has inputs 0 3 6 and seven targets; frames of a person count as one person."""
+    """The documented protocol has inputs 0 3 6 and seven targets."""
     data = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0")
     samples = list(data.evaluation_loader(views=3))
     assert len(samples) == 3
@@ -299,7 +299,6 @@ def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(humman_root
     images = (255 * targets.images[0].movedim(1, -1)).round()
     np.testing.assert_array_equal(images, [view.image for view in views])
     np.testing.assert_array_equal(targets.cameras.extrinsics[0], [view.extrinsics for view in views])
-    assert data.dataset.reader("val").people == 1
 
 
 def test_smpl_vertices_project_into_every_mask(humman_root):
@@ -307,8 +306,8 @@ def test_smpl_vertices_project_into_every_mask(humman_root):
     pytest.importorskip("smplx")
     data = of_humman(humman_root, smpl_model=humman_root.with_name("recon_body_models"))
     for name in data.reader.subjects:
-        assert data.body(name).shape == (6890, 3)
-        assert min(inside(data.view(name, k), data.body(name)) for k in range(10)) > 0.97
+        assert data.reader.read_checked_body(name).shape == (6890, 3)
+        assert min(inside(data.view(name, k), data.reader.read_checked_body(name)) for k in range(10)) > 0.97
 
 
 def test_smpl_turns_about_the_pelvis_and_then_shifts(humman_root):

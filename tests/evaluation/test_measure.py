@@ -93,7 +93,7 @@ def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_p
     """`metrics.json` describes the model that ran, on data and targets as given."""
     path = trained / "checkpoints" / "last.ckpt"
     code = ghgs(
-        "evaluate", f"checkpoint={path}", "data.cache_images_mb=1", "targets=midway", "evaluation.views=[3]",
+        "evaluate", f"checkpoint={path}", "data.workers=0", "targets=midway", "evaluation.views=[3]",
         "recalibration.similarity=none", "recalibration.k=1", "skip=none", "evaluation.pictures=0",
         f"hydra.run.dir={tmp_path / 'run'}",
     )  # fmt: skip

@@ -11,13 +11,12 @@ import torch
 from ghgs_lit.cli.verbs import Train
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.module import number_of_rounds, sample_budget, token_budget
+from ghgs_lit.training.module import sample_budget, token_budget
 from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
-from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
+from tests.helpers.training import Standin, StepData, flat_renderer
 
-CLASSES = {"seed": 3, "data": {"class_steps": 4}}
 # The configured preset, a budget, and the preset to which the budget corresponds.
 PRESETS = [
     ("fast", "all", ["skip=exact"]),
@@ -68,12 +67,11 @@ class Watched(Standin):
         return super().forward(batch)
 
 
-def fit(folder, steps, resume=None, class_steps=1):
+def fit(folder, steps, resume=None):
     model = Watched()
-    config = {"seed": 3, "data": {"class_steps": class_steps}}
     options = Optimization(lr=0.05)
     budgets = ["all", "window", 0, 1, 2]
-    module = GHGSModule(model, flat_renderer, losses_of({"render_l1": 1.0}), options, config, budgets)
+    module = GHGSModule(model, flat_renderer, losses_of({"render_l1": 1.0}), options, {"seed": 3}, budgets)
     trainer = L.Trainer(
         accelerator="cpu", max_steps=steps, max_epochs=-1, default_root_dir=folder, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
@@ -93,25 +91,6 @@ def test_a_resumed_run_draws_as_the_whole_one_and_validates_as_configured(tmp_pa
     assert whole.trained == half.trained + rest.trained
     assert len(set(whole.trained)) == 5
     assert set(whole.validated) == {("subject", 7)}
-
-
-def test_a_class_of_steps_has_one_budget_and_one_number_of_rounds(tmp_path):
-    """A run of ``class_steps`` steps shares one budget and one number of rounds, also if training starts
-    within it."""
-    trained = fit(tmp_path, 18, class_steps=6).trained
-    assert [trained[first : first + 6] for first in (0, 6, 12)] == [[trained[n]] * 6 for n in (0, 6, 12)]
-    assert len(set(trained)) > 1
-    model = make_model("model=recurrent").train()
-    module = GHGSModule(model, flat_renderer, losses_of({"render_l1": 1.0}), Optimization(), CLASSES)
-    module._trainer = SimpleNamespace(accumulate_grad_batches=2, global_step=2, strategy=None)
-    steps = [module._make_step(example_batch(), number) for number in range(4)]
-    assert len({step.seed for step in steps}) == 2
-    assert steps[0].rounds == steps[1].rounds in model.rounds.options.training_counts
-    with number_of_rounds(model, 3):
-        model.rounds._sample_count = None
-        with model.rounds.fix_count():
-            assert model.rounds._known_count == 3
-    assert model.rounds._known_count is None
 
 
 @pytest.mark.parametrize("choices", [[], ["windows"], [-1], ["all", "1"]])
