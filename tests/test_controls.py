@@ -136,7 +136,6 @@ def test_attention_knows_the_true_parts(controls, monkeypatch):
     for similarity in ("product", "none"):
         model = model_of(similarity=similarity)
         tokens, points, result = calls_of(model, batch)
-        # as shown in pictures of attention
         assert torch.equal(tokens.semantic, points.shares.sqrt())
         results = [result.latent[3]]
         with monkeypatch.context() as patched:

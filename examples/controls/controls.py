@@ -92,7 +92,7 @@ class Control(Recalibration):
     def __init__(self, options: ControlOptions, dim_latent: int):
         super().__init__(options, dim_latent)
         self.control = options.control
-        # a hook, so that visualizations of attention use these features, too
+        # a hook, so that measured neighbourhoods use these features, too
         self.register_forward_pre_hook(_insert_parts)
 
     def forward(self, tokens: Tokens, points: KnownPoints, plan) -> Tokens:

@@ -1,7 +1,6 @@
 """Image and geometry metrics: pure functions, and named protocols that compute them."""
 
-from ghgs_lit.metrics.flip import flip_map
-from ghgs_lit.metrics.functional import PSNR_CAP, depth_error_mm, psnr, ssim, surface_error_mm
+from ghgs_lit.metrics.functional import PSNR_CAP, depth_error_mm, flip_map, psnr, ssim, surface_error_mm
 from ghgs_lit.metrics.protocol import FURTHER, ImageMetrics, MetricsOptions
 
 __all__ = [

@@ -3,6 +3,8 @@
 A region (:mod:`ghgs_lit.metrics.regions`) selects pixels. If it is empty the value is nan, which
 averages ignore."""
 
+import flip_evaluator
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -160,6 +162,26 @@ def ssim(
     Raises:
         InputError: as :func:`ssim_map`."""
     return mean_inside(ssim_map(image, target, padding).mean(1), region)
+
+
+def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
+    """FLIP of each pixel, by its authors' package at its default of 67 pixels a degree, on the CPU.
+
+    P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A
+    Difference Evaluator for Alternating Images", HPG 2020.
+
+    Args:
+        image: sRGB; values outside [0, 1] are clamped.
+        target: sRGB; values outside [0, 1] are clamped.
+
+    Returns:
+        Maps in [0, 1], 0 where the images are equal; float32, on the device of ``image``."""
+    maps = []
+    for pair in zip(target, image, strict=True):
+        arrays = [each.float().clamp(0, 1).permute(1, 2, 0).contiguous().cpu().numpy() for each in pair]
+        values, *_ = flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False, computeMeanError=False)
+        maps.append(values[..., 0])
+    return torch.from_numpy(np.stack(maps)).to(image.device)
 
 
 def spill(

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import InputError, import_optional
-from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
     BESIDE,
     BRIGHTNESS,
     INNER,
     PSNR_CAP,
     decibels,
+    flip_map,
     psnr_box_40,
     sharpness,
     spill,
@@ -208,7 +208,7 @@ class ImageMetrics:
         if "ssim" in measured:
             text["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
         if "flip" in measured:
-            text["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
+            text["flip"] = "FLIP at 67.02 pixels a degree"
         for region in _REGIONS:
             if region in options.regions:
                 text |= _REGIONS[region]

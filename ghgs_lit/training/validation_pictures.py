@@ -1,6 +1,5 @@
-"""Validation pictures, attention maps and point clouds of the first subjects."""
+"""Validation pictures and point clouds of the first subjects."""
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from ghgs_lit.config.options import Index, Options
-from ghgs_lit.geometry.padding import pad_to_patches
-from ghgs_lit.method.recalibration.inspection import Call, attention_of, collect_calls
 from ghgs_lit.types import Batch, Prediction
-from ghgs_lit.visualization.attention import attention_sheet, choose_token
 from ghgs_lit.visualization.pictures import clouds, save_png, sheet
 
 #: TensorBoard's view of point clouds: points of two centimetres in a perspective camera.
@@ -26,15 +22,11 @@ CLOUD_VIEW = {
 
 
 class PicturesOptions(Options):
-    """Pictures of the first subjects of each validation;
-    of the first one also its attention and point clouds."""
+    """Pictures of the first subjects of each validation; of the first one also its point clouds."""
 
     group = "callbacks.pictures"
     subjects: Index = 2
     """Number of subjects; 0: none."""
-    token: tuple[Index, Index, Index] | None = None
-    """Token whose attention is shown: view, row and column in the token grid of the padded views;
-    null: the middle of the subject in its first view."""
 
     def build(self) -> "Pictures":
         """Create the callback."""
@@ -45,19 +37,15 @@ class Pictures(Callback):
     """Logs pictures of validation subjects, and writes them to ``<run>/pictures``.
 
     * ``view/sheet/<subject>``: inputs, depths, targets, renderings and errors;
-    * ``view/attention/<subject>``: attention of one token of the recalibration;
     * ``values/*``, in TensorBoard's tabs of distributions: values of all Gaussians;
     * ``<subject>/points``, in its mesh tab: the predicted points and the body's vertices."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options
-        self._stack = ExitStack()
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Start recording calls of the recalibration for the first batch."""
+        """Begin with the first subject."""
         self._number = 0
-        stage = getattr(pl_module.model, "recalibration", None)
-        self._calls = self._stack.enter_context(collect_calls(stage if self.options.subjects else None))
 
     def on_validation_batch_end(
         self,
@@ -71,7 +59,6 @@ class Pictures(Callback):
 
         Args:
             outputs: result of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`."""
-        self._stack.close()
         prediction = outputs["prediction"]
         image = outputs["rendering"].image
         count = min(self.options.subjects - self._number, len(batch.images))
@@ -80,23 +67,10 @@ class Pictures(Callback):
             picture = sheet(batch, image, element, prediction.depth, prediction.depth_valid)
             _publish(trainer, f"view/sheet/{name}", picture, name)
             if self._number == 0:
-                for call in self._calls[-1:]:
-                    self._show_attention(trainer, batch, call, name)
                 for logger in trainer.loggers:
                     if isinstance(logger, TensorBoardLogger):
                         _log_values(logger.experiment, batch, prediction, name, trainer.global_step)
             self._number += 1
-        self._calls = []
-
-    def _show_attention(self, trainer: L.Trainer, batch: Batch, call: Call, name: str) -> None:
-        """Log the attention of the chosen token of the first subject."""
-        _, tokens, points = call
-        token = choose_token(tokens, points, 0, self.options.token)
-        attention = None if token is None else attention_of(*call, token)
-        if attention is not None:
-            padding = pad_to_patches(batch.masks, tokens.patch_size)
-            picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
-            _publish(trainer, f"view/attention/{name}", picture, f"{name}_attention")
 
 
 def distributions(prediction: Prediction) -> dict[str, Tensor]:

@@ -1,1 +1,1 @@
-"""Pictures of predictions, of attention, and point clouds."""
+"""Pictures of predictions, and point clouds."""

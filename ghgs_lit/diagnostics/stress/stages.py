@@ -29,7 +29,6 @@ from ghgs_lit.method.bounds import VisualHull, rays
 from ghgs_lit.method.heads import attributes, dpt
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.method.recalibration import SemanticAttention
-from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.ops import activation, neighbors
 from ghgs_lit.ops.attention.cpu import attend_heads
@@ -313,8 +312,7 @@ def _losses(v: Values) -> Values:
 
 
 def _metrics(v: Values) -> Values:
-    flip = flip_map(v["image"], v["target"]).flatten(1).mean(1)
-    return {"psnr": psnr(v["image"], v["target"]), "flip": flip}
+    return {"psnr": psnr(v["image"], v["target"])}
 
 
 _BOUNDED = "a value between bounds is finite whatever the raw value"
@@ -429,11 +427,7 @@ STAGES = [
         "means of squares of differences", gradients=("points", "surface"), seeds=96, sizes=_ties,
     ),
     Stage(
-        "PSNR and FLIP", ("images",), _pair, _metrics, 100,
-        "powers 0.42 and 2.4 of colours, seven filters, a power 0.7 of a distance",
-        # FLIP raises a rounding error of a colour to a power of about 0.1; one pixel of 256 may have one.
-        kappa=lambda v: torch.tensor([8.0]),
-        silent="FLIP clamps colours to [0, 1]",
+        "PSNR", ("images",), _pair, _metrics, 100, "a mean of squared differences, and its logarithm",
     ),
 ]  # fmt: skip
 if "avx512f" in processor_features():
