@@ -89,6 +89,14 @@ class Gsplat:
         return radii, values[..., :2].contiguous(), values[..., 2], values[..., 3:6], compensations
 
     @staticmethod
+    def rasterization(means: Tensor, colors: Tensor, width: int, height: int, **options: Any) -> tuple:
+        seen = means.sum() + colors.sum()
+        seen.item()  # the number of intersections
+        views = options["viewmats"].shape[:2]
+        values = means.new_zeros(*views, height, width, colors.shape[-1] + 1) + 0 * seen
+        return values, values[..., :1], {}
+
+    @staticmethod
     def rasterize_to_pixels(
         means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int,
         *lists: Any, **options: Any,

@@ -1,10 +1,9 @@
 """Capacity of the buffers for intersections of splats with tiles.
 
-Reading the number of intersections would synchronise device and host before anything is rendered. So
-each rendering gets the capacity that similar ones needed, with a margin; the number that it really
-needed is read later: while the GPU renders, or after several renderings
-(:func:`repeat_until_sufficient`). If the capacity was too small, the rendering is repeated with enough:
-an image never lacks splats."""
+Reading the number of intersections would synchronise device and host, which a CUDA graph cannot capture.
+So each rendering gets the capacity that similar ones needed, with a margin; the number that it really
+needed is read after several renderings (:func:`repeat_until_sufficient`). If a capacity was too small,
+the renderings are repeated with enough: an image never lacks splats."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -20,7 +19,6 @@ from torch import Tensor
 from ghgs_lit.extents import bucket_size
 
 T = TypeVar("T")
-Drawn = TypeVar("Drawn")
 #: Initial estimate of the number of tiles that a splat touches, and safety factor of capacities.
 _FIRST = 4.0
 _SPARE = 1.25
@@ -48,14 +46,6 @@ class Room:
     capacity: int
     needed: Int[Tensor, ""]
 
-    def expect(self, needed: int) -> bool:
-        """Update the estimate for later renderings of the same grid; returns whether the capacity
-        sufficed for ``needed`` intersections."""
-        per_splat = needed / self.splats
-        before = _expected.get(self.grid, 0.0)
-        _expected[self.grid] = max(per_splat, before + _FALL * (per_splat - before))
-        return needed <= self.capacity
-
 
 @dataclass
 class Rooms:
@@ -64,14 +54,22 @@ class Rooms:
     rooms: list[Room] = field(default_factory=list)
 
     def suffice(self) -> bool:
-        """Whether every rendering had enough capacity; one device-to-host synchronisation."""
+        """Whether every rendering had enough capacity; one device-to-host synchronisation.
+
+        Updates the estimates for later renderings.
+        """
         if not self.rooms:
             return True
         numbers = torch.stack([room.needed for room in self.rooms]).tolist()
-        return all([room.expect(number) for room, number in zip(self.rooms, numbers, strict=True)])
+        for room, needed in zip(self.rooms, numbers, strict=True):
+            per_splat = needed / room.splats
+            before = _expected.get(room.grid, 0.0)
+            _expected[room.grid] = max(per_splat, before + _FALL * (per_splat - before))
+        return all(needed <= room.capacity for room, needed in zip(self.rooms, numbers, strict=True))
 
 
-_rooms: ContextVar[Rooms | None] = ContextVar("rooms", default=None)
+#: Capacities of the current context; None outside of :func:`defer_checks`.
+deferred: ContextVar[Rooms | None] = ContextVar("deferred", default=None)
 
 
 @contextmanager
@@ -79,11 +77,11 @@ def defer_checks() -> Iterator[Rooms]:
     """Context in which renderings do not check their capacities: the caller must check
     :meth:`Rooms.suffice`."""
     rooms = Rooms()
-    token = _rooms.set(rooms)
+    token = deferred.set(rooms)
     try:
         yield rooms
     finally:
-        _rooms.reset(token)
+        deferred.reset(token)
 
 
 def repeat_until_sufficient(call: Callable[[], T]) -> T:
@@ -96,7 +94,7 @@ def repeat_until_sufficient(call: Callable[[], T]) -> T:
         call: renders, any number of times, and may be called repeatedly. Inside :func:`defer_checks` it
             is called once and not checked.
     """
-    if _rooms.get() is not None:
+    if deferred.get() is not None:
         return call()
     while True:
         with defer_checks() as rooms:
@@ -105,56 +103,11 @@ def repeat_until_sufficient(call: Callable[[], T]) -> T:
             return result
 
 
-def render_with_capacity(
-    grid: Grid,
-    splats: int,
-    find: Callable[[int], tuple[T, Tensor]],
-    draw: Callable[[T], Drawn],
-) -> Drawn:
-    """Find and render intersections with enough capacity.
+def expected_capacity(grid: Grid, splats: int) -> int:
+    """Capacity for a rendering.
 
     Args:
         grid: tiles of an image (rows, columns).
         splats: number of splats of all images together, at least 1.
-        find: finds intersections, given a capacity; returns them and the number needed.
-        draw: renders intersections.
-
-    Returns:
-        The last result of ``draw``. Inside :func:`defer_checks` it may lack splats: the caller checks
-        the capacities.
     """
-    rooms = _rooms.get()
-    while True:
-        capacity = bucket_size(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
-        intersections, needed = find(capacity)
-        room = Room(grid, splats, capacity, needed)
-        number = Coming(needed) if rooms is None else None
-        drawn = draw(intersections)
-        if rooms is not None:
-            rooms.rooms.append(room)
-            return drawn
-        if room.expect(number.read()):
-            return drawn
-
-
-class Coming:
-    """Asynchronous copy of a scalar to the host, which waits for it only on reading.
-
-    Args:
-        value: a scalar on any device.
-    """
-
-    def __init__(self, value: Int[Tensor, ""]):
-        self.value = value
-        self.arrived = None
-        if value.is_cuda:
-            self.value = torch.empty((), dtype=value.dtype, pin_memory=True)
-            self.value.copy_(value, non_blocking=True)
-            self.arrived = torch.cuda.Event()
-            self.arrived.record(torch.cuda.current_stream(value.device))
-
-    def read(self) -> int:
-        """Return the number; waits only for work that was queued before its copy."""
-        if self.arrived is not None:
-            self.arrived.synchronize()
-        return int(self.value)
+    return bucket_size(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)

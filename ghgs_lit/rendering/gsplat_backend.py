@@ -1,20 +1,19 @@
 """The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat.
 
-gsplat's kernels project and rasterize. The step in between, finding the splats of each tile, is done
-by :mod:`ghgs_lit.ops.intersections`, since gsplat's own causes a device-to-host synchronisation."""
+gsplat's kernels project and rasterize. In predictions and captured training steps, the step in between,
+finding the splats of each tile, is done by :mod:`ghgs_lit.ops.intersections`, since gsplat's own
+causes a device-to-host synchronisation."""
 
 import importlib
-import warnings
-from functools import cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.ops.intersections import TILE, Intersections, intersections
+from ghgs_lit.ops.intersections import TILE, intersections
 from ghgs_lit.ops.rasterization.settings import RasterSettings
-from ghgs_lit.rendering.capacity import render_with_capacity
+from ghgs_lit.rendering.capacity import Room, Rooms, deferred, expected_capacity
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: The limit of alpha that is compiled into gsplat.
@@ -25,8 +24,6 @@ _WARP = 32
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
 #: Versions whose kernels are known to accept these intersections.
 _KNOWN = ("1.5.3",)
-#: Largest number of channels, with depth, that gsplat rasterizes in one pass.
-_CHANNELS = 32
 
 
 class BackendUnavailable(InputError):
@@ -125,8 +122,9 @@ def _render(
         "far_plane": far,
         "eps2d": settings.low_pass,
     }
-    if _is_known(gsplat) and colors.shape[-1] < _CHANNELS:
-        values, alpha = _render_without_sync(gsplat, seen, colors, settings.antialiased)
+    rooms = deferred.get()
+    if rooms is not None and gsplat.__version__ in _KNOWN:
+        values, alpha = _render_without_sync(gsplat, seen, colors, settings.antialiased, rooms)
     else:
         mode = "antialiased" if settings.antialiased else "classic"
         options = {"render_mode": "RGB+ED", "packed": False, "rasterize_mode": mode}
@@ -134,22 +132,8 @@ def _render(
     return torch.cat((values, alpha), dim=-1).movedim(-1, -3)
 
 
-@cache
-def _is_known(gsplat: Any) -> bool:
-    """Whether gsplat's kernels can be called one by one; warns once for unknown versions."""
-    version = getattr(gsplat, "__version__", "unknown")
-    known = version in _KNOWN
-    if not known:
-        warnings.warn(
-            f"renderer.backend=gsplat: the version of gsplat is {version}, not {', '.join(_KNOWN)}: images "
-            "are drawn by its function rasterization, in which the host waits for the GPU",
-            stacklevel=2,
-        )
-    return known
-
-
 def _render_without_sync(
-    gsplat: Any, seen: dict[str, Any], colors: Tensor, antialiased: bool
+    gsplat: Any, seen: dict[str, Any], colors: Tensor, antialiased: bool, rooms: Rooms
 ) -> tuple[Tensor, Tensor]:
     """gsplat's ``rasterization`` without its device-to-host synchronisation.
 
@@ -158,6 +142,7 @@ def _render_without_sync(
         seen: Gaussians and cameras, arguments of gsplat's ``fully_fused_projection``.
         colors: [B, N, C].
         antialiased: whether to multiply opacities by gsplat's compensations.
+        rooms: gets the capacity of the rendering, which may lack splats: the caller checks it.
 
     Returns:
         Colours and expected depth [B, T, h, w, C + 1], and alpha [B, T, h, w, 1].
@@ -171,18 +156,14 @@ def _render_without_sync(
     if antialiased:
         opacities = opacities * compensations
     colors = torch.cat((colors[:, None].expand(*depths.shape, -1), depths[..., None]), -1)
-
-    def find(capacity: int) -> tuple[Intersections, Tensor]:
-        listed = intersections(centers.detach(), radii, depths.detach(), height, width, capacity)
-        return listed, listed.needed
-
-    draw = partial(gsplat.rasterize_to_pixels, centers, conics, colors, opacities, width, height, TILE)
-
-    def draw_listed(listed: Intersections) -> tuple[Tensor, Tensor]:
-        return draw(listed.offsets, listed.splats, masks=listed.has_pixels)
-
     grid = (-(-height // TILE), -(-width // TILE))
-    values, alpha = render_with_capacity(grid, depths.numel(), find, draw_listed)
+    capacity = expected_capacity(grid, depths.numel())
+    listed = intersections(centers.detach(), radii, depths.detach(), height, width, capacity)
+    rooms.rooms.append(Room(grid, depths.numel(), capacity, listed.needed))
+    values, alpha = gsplat.rasterize_to_pixels(
+        centers, conics, colors, opacities, width, height, TILE, listed.offsets, listed.splats,
+        masks=listed.has_pixels,
+    )  # fmt: skip
     depth = values[..., -1:] / alpha.clamp(min=1e-10)
     return torch.cat((values[..., :-1], depth), -1), alpha
 

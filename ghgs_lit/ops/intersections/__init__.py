@@ -4,7 +4,6 @@ gsplat's function copies the number of intersections to the host, and the GPU id
 read it and has launched the next kernels. Here arrays have a fixed capacity instead, and the required
 number is a tensor that can be read later (:mod:`ghgs_lit.rendering.capacity`)."""
 
-from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -67,17 +66,20 @@ def intersections(
     shape = depths.shape[:-1]
     rows = -(-height // TILE)
     columns = -(-width // TILE)
-    fixed = _tile_constants(shape, rows, columns, centers.device)
+    tiles = shape.numel() * (rows + 1) * columns
+    # Radix sort: the time is proportional to the number of bytes of a key.
+    kind = torch.int16 if tiles <= 2**15 else torch.int32
+    every = constant(torch.arange, tiles, like=centers, dtype=kind)
+    has_pixels = constant(_have_pixels, *shape, rows, columns, like=centers, dtype=torch.bool)
     centers = centers.reshape(-1, depths.shape[-1], 2)
     radii = radii.reshape(centers.shape)
     _, order = depths.contiguous().view(torch.int32).flatten().sort(stable=True)
     boxes = _BOXED(centers, radii, order, rows, columns)
     ends = boxes[0].cumsum(0)
-    tile, splat = _PLACED(ends, boxes, order, fixed.every, capacity, columns)
-    # Radix sort: the time is proportional to the number of bytes of a key.
+    tile, splat = _PLACED(ends, boxes, order, every, capacity, columns)
     tile, order = tile.sort(stable=True)
-    offsets = torch.searchsorted(tile, fixed.every, out_int32=True).view(fixed.has_pixels.shape)
-    return Intersections(splat[order], offsets, fixed.has_pixels, ends[-1])
+    offsets = torch.searchsorted(tile, every, out_int32=True).view(has_pixels.shape)
+    return Intersections(splat[order], offsets, has_pixels, ends[-1])
 
 
 def _find_tiles(
@@ -99,7 +101,7 @@ def _find_tiles(
     Returns:
         Number of tiles of each splat, index of the first tile, and number of tiles across (at least 1).
     """
-    sizes = constant(_sizes, columns, rows, like=centers)
+    sizes = constant(torch.tensor, (columns, rows), like=centers)
     reach = radii / TILE
     begin = torch.clamp(torch.floor(centers / TILE - reach), centers.new_zeros(()), sizes).int()
     end = torch.clamp(torch.ceil(centers / TILE + reach), centers.new_zeros(()), sizes).int()
@@ -109,11 +111,6 @@ def _find_tiles(
     tiles = size.prod(-1) * (radii > 0).all(-1)
     boxes = torch.stack((tiles, first, size[..., 0].clamp(min=1)))
     return boxes.flatten(1)[:, order].int()
-
-
-def _sizes(columns: int, rows: int, **kind: object) -> Tensor:
-    """Numbers of tiles across and down, [2]."""
-    return torch.tensor((columns, rows), **kind)
 
 
 def _list_intersections(
@@ -163,27 +160,7 @@ _PLACED = Operator(
 )
 
 
-class _Fixed(NamedTuple):
-    """Constants that depend only on the number and the size of the images.
-
-    Attributes:
-        every: indices of all tiles, the row below each image included.
-        has_pixels: see :class:`Intersections`.
-    """
-
-    every: Tensor
-    has_pixels: Tensor
-
-
-# unbounded: captured CUDA graphs refer to these tensors
-@cache
-# the first call may be in a validation, but training steps save these tensors for the backward pass
-@torch.inference_mode(False)
-def _tile_constants(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:
-    """Constants of :func:`intersections` for a batch shape ``images`` with ``rows`` x ``columns`` tiles
-    each, cached per device."""
-    count = images.numel() * (rows + 1) * columns
-    every = torch.arange(count, dtype=torch.int16 if count <= 2**15 else torch.int32)
-    has_pixels = torch.ones(*images, rows + 1, columns, dtype=torch.bool)
-    has_pixels[..., -1, :] = False
-    return _Fixed(every.to(device, non_blocking=True), has_pixels.to(device, non_blocking=True))
+def _have_pixels(*shape: int, **kind: object) -> Tensor:
+    """Ones [..., rows, columns] with another row of zeros."""
+    ones = torch.ones(shape, **kind)
+    return torch.cat((ones, torch.zeros_like(ones[..., :1, :])), -2)
