@@ -408,8 +408,7 @@ class Prediction(TensorStruct):
     """Result of ``model(batch)``, in the world frame and unit of the input cameras.
 
     ``depth`` is meaningful where ``depth_valid``. ``rounds``: depths before the first round and after
-    each (the last is ``depth_maps``). ``drafts``: Gaussians before each round, if kept. ``tokens``:
-    of the encoder, only inside the model.
+    each (the last is ``depth_maps``). ``tokens``: of the encoder, only inside the model.
     """
 
     gaussians: Gaussians
@@ -418,7 +417,6 @@ class Prediction(TensorStruct):
     points: Points
     depth_maps: DepthMaps
     rounds: tuple[DepthMaps, ...] = ()
-    drafts: tuple[Gaussians, ...] = ()
     tokens: Tokens | None = None
 
 

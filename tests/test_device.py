@@ -22,9 +22,8 @@ from ghgs_lit.ops import ray_marching
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.callbacks import PicturesOptions
 from ghgs_lit.training.checkpoints import CheckpointOptions
-from ghgs_lit.training.cost import Costs
-from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.losses import losses_of
@@ -92,7 +91,6 @@ def train(folder, **place):
         limit_val_batches=1,
         default_root_dir=folder,
         callbacks=[
-            Costs(),
             PicturesOptions(subjects=1).build(),
             CheckpointOptions(filename="last", every_n_train_steps=2).build(),
         ],

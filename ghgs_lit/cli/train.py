@@ -35,9 +35,8 @@ from ghgs_lit.runs.processes import (
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import GHGSModule, loggers, start
-from ghgs_lit.training.callbacks import NeighborsAtStart
+from ghgs_lit.training.callbacks import TrainingCost
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep
-from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.weights import switches
 from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.reading import file_of
@@ -220,7 +219,7 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     module.config = {**module.config, **run.plain}
     silence_lightning()
     cost = TrainingCost()
-    trainer = build_trainer(run, directory, cost, StopAtStep(), NeighborsAtStart())
+    trainer = build_trainer(run, directory, cost, StopAtStep())
     module.metrics = run.metrics.build().to(trainer.strategy.root_device)
     # The last check, because it renders missing images.
     check_evaluation(run, data)

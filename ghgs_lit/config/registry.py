@@ -108,9 +108,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
     "callbacks": {
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
-        "costs": "ghgs_lit.training.cost.CostsOptions",
-        "ema": "ghgs_lit.training.callbacks.AveragingOptions",
-        "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
+        "pictures": "ghgs_lit.training.callbacks.PicturesOptions",
         "progress": "ghgs_lit.training.callbacks.ProgressOptions",
     },
     "evaluation": {None: "ghgs_lit.config.nodes.EvaluationOptions"},

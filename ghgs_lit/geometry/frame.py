@@ -122,7 +122,6 @@ class Frame:
             ),
             depth_maps=maps,
             rounds=tuple(_scale_maps(each_round, metre, known) for each_round in prediction.rounds),
-            drafts=tuple(self._gaussians(draft, views, world) for draft in prediction.drafts),
         )
 
     def _gaussians(self, gaussians: Gaussians, views: int, world: Tensor) -> Gaussians:

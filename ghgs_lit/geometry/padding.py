@@ -57,7 +57,6 @@ class Padding:
             points=dataclasses.replace(prediction.points, pixels=pixels, valid=whole.valid),
             depth_maps=whole,
             rounds=tuple(self._cut_maps(maps) for maps in prediction.rounds),
-            drafts=tuple(self._cut_gaussians(draft) for draft in prediction.drafts),
         )
 
     def _cut_maps(self, maps: DepthMaps) -> DepthMaps:

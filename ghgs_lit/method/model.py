@@ -66,8 +66,6 @@ class GHGS(nn.Module):
         self.skip = skip or SkipOptions()
         #: Nodes that :meth:`from_config` built the model from; empty if it was built otherwise.
         self.config: dict[str, Any] = {}
-        #: Whether predictions, except in training, contain the Gaussians before each round.
-        self.keeps_drafts = False
 
     def forward(self, batch: Batch, plan: Plan | None = None, coarse: Coarse | None = None) -> Prediction:
         """Predict Gaussians, depths and points in the world of the batch's cameras.
@@ -92,7 +90,7 @@ class GHGS(nn.Module):
         state = State(raw, None, points, depth_maps)
         step = 1.0 if coarse is None else coarse.depths.step
         states = self.rounds(state, self.gaussian_head.activate, batch, step)
-        return prediction_of(states, self.keeps_drafts and not self.training, encoded)
+        return prediction_of(states, encoded)
 
     def _for_heads(self, tokens: Tokens) -> Tokens:
         """Convert tokens to the dtype of the heads, which may differ from that of the encoder."""

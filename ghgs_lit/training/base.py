@@ -12,7 +12,6 @@ from torch import nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.runtime.watching import time_mark
 from ghgs_lit.training.optimization import Optimization, convert_rates_to_numbers, hold_rates
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
@@ -35,8 +34,6 @@ class BudgetedModule(L.LightningModule):
             contain it, merged into the model's configuration. None: only the model's.
 
     Attributes:
-        ready: time at which the last step, its callbacks and any validation ended; the wait for data
-            is measured from here.
         used_budget: used share of the run's budget in [0, 1] at the last step."""
 
     def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any] | None):
@@ -45,7 +42,6 @@ class BudgetedModule(L.LightningModule):
         self.optimization = optimization
         self.config = {**getattr(model, "config", {}), **(config or {})}
         self.used_budget = 0.0
-        self.ready = time_mark(torch.device("cpu"))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Copy a batch to a device, without a synchronisation if its memory is pinned."""
@@ -54,7 +50,6 @@ class BudgetedModule(L.LightningModule):
 
     def on_train_start(self) -> None:
         """Resume the used share of the budget, and apply this run's options of the optimizer."""
-        self.ready = time_mark(self.device)
         # After a restart the scheduler would update it only at the end of the first step.
         self.used_budget = self.progress()
         # Lightning has restored the options that the checkpoint was trained with.
@@ -151,14 +146,6 @@ class BudgetedModule(L.LightningModule):
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-    def on_train_batch_end(self, *args: Any) -> None:
-        """Store the time at which the step ended."""
-        self.ready = time_mark(self.device)  # Lightning calls this after all callbacks
-
-    def on_validation_end(self) -> None:
-        """Exclude the validation from the next step's wait for data."""
-        self.on_train_batch_end()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check that Muon does not resume from AdamW's state, or vice versa.

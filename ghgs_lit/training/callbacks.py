@@ -1,21 +1,22 @@
-"""Callbacks: progress of a run, neighbourhoods of the recalibration, exponential average of weights."""
+"""Callbacks: progress of a run, its time and memory, and validation pictures."""
 
 import time
-from contextlib import ExitStack
 from pathlib import Path
-from statistics import fmean
-from typing import Annotated, Any
+from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.callbacks import Callback, WeightAveraging
-from pydantic import Field
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback, Timer
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Column
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from ghgs_lit.config.options import Options
-from ghgs_lit.method.recalibration.inspection import collect_calls, neighborhoods
+from ghgs_lit.config.options import Index, Options
 from ghgs_lit.runs.progress import Lines, format_duration, on_terminal
+from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
+from ghgs_lit.types import Batch
+from ghgs_lit.visualization.pictures import save_png, sheet
 
 
 class ProgressOptions(Options):
@@ -78,62 +79,107 @@ class RunProgress(Callback):
             self._bar.stop()
 
 
-class NeighborsAtStart(Callback):
-    """Prints, for the first step, the number of tokens that take part in the recalibration, the number
-    of their neighbours, and the share of these that the other value of
-    ``recalibration.neighborhood`` has in common."""
+class TrainingCost(Callback):
+    """Seconds and peak memory of the training, over all sessions of a run, with validations and writing
+    of checkpoints.
+
+    Checkpoints contain both, so that a resumed run continues to count. What a killed process did after
+    its last checkpoint is repeated, and counts once.
+
+    Has a timer instead of being one: Lightning ignores ``max_time`` if any callback is a Timer."""
+
+    def __init__(self) -> None:
+        self._timer = Timer()
+        self._peak = 0  # bytes, of earlier sessions; of all sessions once training has ended
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Start recording calls of the recalibration."""
-        self._stack = ExitStack()
-        stage = getattr(pl_module.model, "recalibration", None)
-        self._seen = self._stack.enter_context(collect_calls(stage))
+        """Start the timer."""
+        self._timer.on_train_start(trainer, pl_module)
+        self._device = pl_module.device
+        if self._device.type != "cuda":
+            forget_peak()  # runs of a sweep share a process
 
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        """Print the numbers after the first step."""
-        self._stack.close()
-        if self._seen and trainer.is_global_zero:
-            around = neighborhoods(*self._seen[-1])
-            tokens = fmean(one.tokens for one in around)
-            count = fmean(one.neighbors for one in around)
-            shared = fmean(one.shared for one in around)
-            other = "without" if pl_module.model.recalibration.neighborhood == "xyz" else "with"
-            line = f"{tokens:.0f} tokens take part, {count:.0f} neighbours each, {shared:.0%} of them"
-            print(f"recalibration: {line} the same {other} 3D unprojection", flush=True)
-        self._seen = []
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Stop the timer, and store the peak."""
+        self._peak = self.peak_bytes
+        self._timer.on_train_end(trainer, pl_module)
 
-    def on_exception(self, *args: Any) -> None:
-        """Stop recording calls."""
-        if hasattr(self, "_stack"):
-            self._stack.close()
+    @property
+    def seconds(self) -> float:
+        """Seconds of training in all sessions so far."""
+        return self._timer.time_elapsed()
+
+    @property
+    def peak_bytes(self) -> int:
+        """Peak memory in bytes of the first process over all sessions: of tensors on a GPU, or of the
+        process on a CPU."""
+        if self._timer.start_time() is None or self._timer.end_time() is not None:
+            return self._peak
+        on_gpu = self._device.type == "cuda"
+        now = torch.cuda.max_memory_allocated(self._device) if on_gpu else resident_bytes("VmHWM")
+        return max(self._peak, now)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Seconds and peak memory so far, for the checkpoint."""
+        return self._timer.state_dict() | {"peak_bytes": self.peak_bytes}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from the numbers of a checkpoint."""
+        self._timer.load_state_dict(state_dict)
+        self._peak = state_dict["peak_bytes"]
 
 
-class AveragingOptions(Options):
-    """An exponential moving average (EMA) of all weights, those of a loss included. Validations measure
-    it, checkpoints store it in addition to the trained weights, and it is the result of the run."""
+class PicturesOptions(Options):
+    """Pictures of the first subjects of each validation."""
 
-    group = "callbacks.ema"
-    decay: Annotated[float, Field(gt=0, lt=1)] = 0.999
-    """Share of the average that each step keeps."""
+    group = "callbacks.pictures"
+    subjects: Index = 2
+    """Number of subjects; 0: none."""
 
-    def build(self) -> "Averaging":
+    def build(self) -> "Pictures":
         """Create the callback."""
-        return Averaging(self.decay)
+        return Pictures(self)
 
 
-class Averaging(WeightAveraging):
-    """Lightning's exponential average of weights on the training device, updated for all weights of a
-    dtype at once.
+class Pictures(Callback):
+    """Logs ``view/sheet/<subject>``, inputs, depths, targets, renderings and errors, for each of the first
+    validation subjects, and writes it to ``<run>/pictures``."""
 
-    Args:
-        decay: share of the average, in (0, 1), that each step keeps."""
+    def __init__(self, options: PicturesOptions):
+        self.options = options
 
-    def __init__(self, decay: float):
-        super().__init__(multi_avg_fn=get_ema_multi_avg_fn(decay))
+    def on_validation_start(self, *args: Any) -> None:
+        """Begin with the first subject."""
+        self._number = 0
 
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Create the average on the training device."""
-        self._device = trainer.strategy.root_device
-        super().setup(trainer, pl_module, stage)
-        if self._average_model is not None:  # a counter on a GPU would cost a synchronisation a step
-            self._average_model.n_averaged = self._average_model.n_averaged.cpu()
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: dict[str, Any],
+        batch: Batch,
+        *args: Any,
+    ) -> None:
+        """Log the subjects of a batch, up to the configured number.
+
+        Args:
+            outputs: result of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`."""
+        prediction = outputs["prediction"]
+        image = outputs["rendering"].image
+        count = min(self.options.subjects - self._number, len(batch.images))
+        for element in range(count if trainer.is_global_zero else 0):
+            name = batch.subjects[element] if batch.subjects else f"subject_{self._number}"
+            _publish(trainer, name, sheet(batch, image, element, prediction.depth, prediction.depth_valid))
+            self._number += 1
+
+
+def _publish(trainer: L.Trainer, name: str, picture: np.ndarray) -> None:
+    """Write a subject's picture [h, w, 3] uint8 to ``<run>/pictures/step_<step>/<name>.png``, and log it."""
+    step = trainer.global_step
+    save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{name}.png")
+    tag = f"view/sheet/{name}"
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_image(tag, picture, step, dataformats="HWC")
+        elif isinstance(logger, WandbLogger):
+            logger.log_image(tag, [picture])

@@ -22,7 +22,7 @@ COMPARED = ("psnr", "ssim", "depth_error_mm")
 #: Number of input views at which HParams compares runs that were measured with several numbers.
 _VIEWS = 4
 #: Groups of tags that TensorBoard shows first; it sorts groups by name, so others move to ``work/``.
-_FIRST = ("loss", "measured", "val", "values", "view")
+_FIRST = ("loss", "measured", "val", "view")
 #: Settings that are always logged as hyperparameters.
 _ALWAYS = ("seed", "views")
 Value = str | int | float | bool

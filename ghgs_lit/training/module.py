@@ -16,7 +16,6 @@ from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.execution.step import CapturedStep, Outcome
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.losses import Losses
-from ghgs_lit.method.heads.inspection import collect_attributes, offsets_at_limit
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan.presets import KeptTokens, keep_patches
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
@@ -103,7 +102,6 @@ class GHGSModule(BudgetedModule):
         self.guard = Guard(optimization.skip_nonfinite)
         self.metrics = MetricsOptions(lpips="off").build()
         self.means = nn.ModuleDict({name: image_mean() for name in VALIDATED})
-        model.keeps_drafts = True  # validation measures each round
         #: Prepares batches for the model; None: the model is not a :class:`GHGS` and takes them directly.
         self.predictor = Predictor(model) if isinstance(model, GHGS) else None
         self.captured_step = self.predictor and CapturedStep(self.predictor, renderer, losses)
@@ -197,21 +195,18 @@ class GHGSModule(BudgetedModule):
 
         Returns:
             ``prediction`` and ``rendering``, for callbacks."""
-        head = getattr(self.model, "gaussian_head", None)
-        with collect_attributes(head) as seen:
-            prediction, rendering = self(batch)
+        prediction, rendering = self(batch)
         size = len(batch.images)
         for name, values in self._measure(rendering.image, batch.targets, VALIDATED).items():
             self.means[name].update(values)
             is_first = name == VALIDATED[0]
             self.log(f"val/{name}", self.means[name], prog_bar=is_first, on_epoch=True, batch_size=size)
-        means = self._measure_rounds(batch, prediction)
-        if seen and head.has_offset_limit:
-            means["val/offsets_at_limit"] = offsets_at_limit(seen[-1])
         if batch.depths is not None:
-            means["val/depth_error_mm"] = _depth_error(batch, prediction.depth_maps)
-            means["val/surface_mm"] = _surface_error(batch, prediction.gaussians)
-        self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
+            means = {
+                "val/depth_error_mm": _depth_error(batch, prediction.depth_maps),
+                "val/surface_mm": _surface_error(batch, prediction.gaussians),
+            }
+            self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
 
     def _measure(
@@ -222,18 +217,6 @@ class GHGSModule(BudgetedModule):
         flat = (values.flatten(0, 1) for values in (image, targets.images, targets.masks))
         depths = None if targets.depths is None else targets.depths.flatten(0, 1)
         return self.metrics.measure(*flat, known, depths)
-
-    def _measure_rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
-        """PSNR in dB and depth error in mm before each round."""
-        values = {}
-        for number, draft in enumerate(prediction.drafts, start=1):
-            image = self.renderer(draft, batch.targets.cameras).image
-            psnr = self._measure(image, batch.targets, ("psnr",))["psnr"]
-            values[f"val/psnr_before_round_{number}"] = psnr.mean()
-            if batch.depths is not None:
-                error = _depth_error(batch, prediction.rounds[number - 1])
-                values[f"val/depth_error_mm_before_round_{number}"] = error
-        return values
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip the gradients of all weights to a norm of ``optimizer.clip``, and log their norm before.

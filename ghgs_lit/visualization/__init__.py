@@ -1,1 +1,1 @@
-"""Pictures of predictions, and point clouds."""
+"""Pictures of predictions."""

@@ -1,26 +1,20 @@
-"""Pictures [h, w, 3] RGB uint8 of input images, renders, errors and depths, and coloured point clouds for
-a 3D viewer."""
+"""Pictures [h, w, 3] RGB uint8 of input images, renders, errors and depths."""
 
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ghgs_lit.files import write_atomically
-from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.types import Batch
 
 _LETTERS = 22  # Width of the narrowest tile divided by the height of letters
 _LEAST_LETTERS = 10  # Least height of letters in pixels
 _GAP = 2
 ERROR_GAIN = 4.0  #: Factor of errors in pictures
-BODY_COLOR = (0.25, 0.5, 0.95)
-
-Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]  #: Positions and colours
 
 
 @cache
@@ -191,37 +185,3 @@ def sheet(
 def save_png(picture: np.ndarray, path: Path) -> None:
     """Write a picture [h, w, 3] RGB uint8 as a PNG, atomically."""
     write_atomically(path, lambda temporary: Image.fromarray(picture).save(temporary, format="PNG"))
-
-
-def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
-    """Point clouds of one subject by name: positions [n, 3] in metres and colours [n, 3] in [0, 1].
-
-    ``points``: unprojected pixels in their colours; ``body``: body vertices, if the data has them;
-    ``points_and_body``: both, whose distance the Chamfer term measures. Empty clouds are left out.
-
-    Args:
-        batch: with images, masks and, optionally, bodies.
-        prediction: prediction of that batch.
-        element: index of the subject in the batch.
-        limit: largest number of points and of vertices.
-    """
-    valid = prediction.points.valid[element] & batch.masks[element]
-    colors = batch.images[element].movedim(1, -1)
-    parts = {"points": (prediction.points.pixels[element][valid], colors[valid])}
-    if batch.body_vertices is not None:
-        body = batch.body_vertices[element]
-        parts["body"] = (body, body.new_tensor(BODY_COLOR).expand(len(body), 3))
-    parts = {name: _thin(cloud, limit) for name, cloud in parts.items()}
-    if "body" in parts:
-        pairs = zip(parts["points"], parts["body"], strict=True)
-        parts["points_and_body"] = tuple(torch.cat(pair) for pair in pairs)
-    return {name: cloud for name, cloud in parts.items() if len(cloud[0])}
-
-
-def _thin(cloud: Cloud, limit: int) -> Cloud:
-    positions, colors = (part.detach().float().cpu() for part in cloud)
-    finite = positions.isfinite().all(-1)
-    positions = positions[finite]
-    colors = colors[finite].nan_to_num(0).clamp(0, 1)
-    step = max(1, -(-len(positions) // limit))
-    return positions[::step], colors[::step]

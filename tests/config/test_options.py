@@ -25,10 +25,7 @@ def shipped_nodes(group):
     files = sorted((conf_dir() / group).glob("*.yaml"))
     configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
     configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent", "pixel")]
-    configurations += [
-        composed("train", *over)
-        for over in (["compat=release"], ["feature_cache.kind=disk"], ["+callbacks.ema.kind=ema"])
-    ]
+    configurations += [composed("train", *over) for over in (["compat=release"], ["feature_cache.kind=disk"])]
     configurations += [composed("train", "experiment=shipped")]
     configurations += [composed(verb) for verb in verbs()]
     nodes = []

@@ -1,7 +1,6 @@
 """Captured training steps, on the pretend device with a stand-in for CUDA graphs."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import lightning.pytorch as L
 import pytest
@@ -16,8 +15,6 @@ from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.callbacks import Averaging
-from ghgs_lit.training.cost import Costs
 from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
@@ -186,7 +183,7 @@ def test_a_step_of_a_training_launches_few_kernels(there, tmp_path, monkeypatch)
     batches = [scene(color=1 - number / 20).to("cpu") for number in range(5)]
     trainer = L.Trainer(
         strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()), max_steps=5,
-        callbacks=[Averaging(0.999), counter], limit_val_batches=0, default_root_dir=tmp_path, logger=False,
+        callbacks=[counter], limit_val_batches=0, default_root_dir=tmp_path, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
     trainer.fit(module, DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
@@ -297,23 +294,3 @@ def test_shape_buckets_are_part_of_a_checkpoint(tmp_path):
     assert other.buckets == captured.buckets
     assert len(other.buckets) == 2
     assert other.buckets.keys() == captured.buckets.keys()
-
-
-def test_times_of_a_step_do_not_keep_it_from_being_captured():
-    """The timing callback of every training wraps stages only in eager steps."""
-    model = training("model=paper")
-    for capture, is_free in (("auto", True), ("off", False)):
-        captured = make_step(model, capture=capture)
-        module = SimpleNamespace(
-            model=model, renderer=Renderer(), losses=LOSSES, device=DEVICE, ready=None, captured_step=captured
-        )
-        costs = Costs()
-        costs.on_train_start(None, module)
-        costs.on_train_batch_start(None, module)
-        assert bool(model.encoder._forward_hooks) != is_free
-        costs.on_before_backward(None, module)
-        costs.on_after_backward(None, module)
-        costs._watch.end("optimizer")
-        costs._watch.end("step")
-        assert ("forward" in costs._watch.seconds()) == is_free
-        costs._stack.close()

@@ -1,7 +1,6 @@
-"""Contents of TensorBoard and CSV logs (tags, times, memory, meshes, HParams), and their continuation."""
+"""Contents of TensorBoard and CSV logs (tags, pictures, HParams), and their continuation."""
 
 import csv
-import dataclasses
 import importlib.util
 import threading
 import time
@@ -9,7 +8,6 @@ import warnings
 
 import lightning.pytorch as L
 import pytest
-import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 from tensorboard.plugins.hparams import plugin_data_pb2
@@ -18,7 +16,7 @@ from ghgs_lit.config import build, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.cost import Costs
+from ghgs_lit.training.callbacks import PicturesOptions
 from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
@@ -28,9 +26,8 @@ from ghgs_lit.training.loggers import (
     hyperparameters,
     log_results,
 )
-from ghgs_lit.training.validation_pictures import PicturesOptions, distributions
 from tests.helpers.losses import losses_of
-from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
+from tests.helpers.training import Standin, StepData, flat_renderer
 
 
 def events(folder) -> EventAccumulator:
@@ -58,24 +55,11 @@ def loggers(folder):
     ]
 
 
-class Staged(Standin):
-    """Stand-in model with two stages to time."""
-
-    def __init__(self):
-        super().__init__()
-        self.encoder, self.depth_head = torch.nn.Identity(), torch.nn.Identity()
-
-    def forward(self, batch):
-        self.encoder(batch.images)
-        self.depth_head(batch.images)
-        return super().forward(batch)
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     subject = GHGSModule(
-        Staged(),
+        Standin(),
         flat_renderer,
         losses_of({"render_l1": 0.8, "chamfer": 1.0}),
         Optimization(lr=0.05, end_factor=0.0),
@@ -84,7 +68,7 @@ def run(tmp_path_factory):
     subject.metrics.lpips = lambda image, target: (image - target).abs().mean((1, 2, 3))
     trainer = L.Trainer(
         accelerator="cpu", max_steps=8, max_epochs=-1, default_root_dir=folder, logger=loggers(folder),
-        callbacks=[Costs(), PicturesOptions(subjects=1).build()],
+        callbacks=[PicturesOptions(subjects=1).build()],
         enable_checkpointing=False, enable_model_summary=False, enable_progress_bar=False,
         num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=2,
     )  # fmt: skip
@@ -100,21 +84,19 @@ def run(tmp_path_factory):
         "| PSNR |",
         8,
     )
-    return folder, subject
+    return folder
 
 
 def test_tags_are_those_that_the_documentation_lists(run):
     """The tags are exactly those, in groups whose names sort losses and validations first; after eight
     steps, logged every second, and two validations only HParams has a single point."""
-    found = events(run[0] / "tensorboard")
+    found = events(run / "tensorboard")
     tags = set(found.Tags()["scalars"])
     groups = {tag.split("/")[0] for kind in ("scalars", "images", "histograms") for tag in found.Tags()[kind]}
-    assert groups == {"loss", "measured", "val", "values", "view", "work"}
+    assert groups == {"loss", "measured", "val", "view", "work"}
     assert [tag for tag in tags if len(found.Scalars(tag)) < 2] == ["measured/psnr_v4_release"]
-    stages = ("01_data", "03_encoder", "04_depth_head", "09_render", "10_loss")
-    times = {f"work/time_ms/{part}" for part in (*stages, "11_backward", "12_optimizer", "step")}
-    assert tags == times | {
-        "loss/total", "loss/render_l1", "loss/chamfer", "work/memory_mb/process",
+    assert tags == {
+        "loss/total", "loss/render_l1", "loss/chamfer",
         "work/train/budget", "work/train/gaussians", "work/train/gradient_norm", "work/train/learning_rate",
         "work/train/skipped_steps",
         "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "val/lpips",
@@ -123,76 +105,34 @@ def test_tags_are_those_that_the_documentation_lists(run):
     }  # fmt: skip
 
 
-def test_distributions_are_of_the_predicted_gaussians(run):
-    """Histograms of each validation show the opacity and the size in millimetres of the stand-in."""
-    found = events(run[0] / "tensorboard")
-    for name, value in {"opacity": 0.9, "scale_mm": 10.0}.items():
-        drawn = found.Histograms(f"values/{name}")
-        assert [event.step for event in drawn] == [4, 8]
-        histogram = drawn[0].histogram_value
-        assert (histogram.min, histogram.max) == pytest.approx((value, value))
-        assert histogram.num > 100
-    # The pixels of its Gaussians are unknown.
-    assert "values/offset_mm" not in found.Tags()["histograms"]
-
-
-def test_offsets_are_distances_from_the_pixels_points():
-    """Offsets are in millimetres, without values that are not finite."""
-    batch = example_batch()
-    prediction = Standin()(batch)
-    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
-    means = prediction.gaussians.means.detach() + torch.tensor([0.003, 0.0, 0.004])
-    means[0] = torch.nan
-    moved = dataclasses.replace(prediction.gaussians, means=means, image=image, pixel=pixel)
-    found = distributions(dataclasses.replace(prediction, gaussians=moved))
-    assert len(found["offset_mm"]) == len(found["opacity"]) - 1
-    torch.testing.assert_close(
-        found["offset_mm"], torch.full_like(found["offset_mm"], 5.0), rtol=1e-3, atol=0
-    )
-
-
 def test_the_numbers_are_those_of_the_steps(run):
-    """Values are logged at the number of steps taken, and a step takes at least as long as its parts."""
-    folder, subject = run
-    found = events(folder / "tensorboard")
+    """Values are logged at the number of steps taken."""
+    found = events(run / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("work/train/learning_rate")}
     assert sorted(rates) == [2, 4, 6, 8]
     assert rates[8] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
     assert [e.value for e in found.Scalars("work/train/budget")] == pytest.approx(
         [1 / 8, 3 / 8, 5 / 8, 7 / 8]
     )
-    parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("work/time_ms/") and "step" not in tag]
-    for place, whole in enumerate(found.Scalars("work/time_ms/step")):
-        assert 0 < sum(found.Scalars(p)[place].value for p in parts) <= whole.value
-    assert 10 < found.Scalars("work/memory_mb/process")[0].value < 1e6
     # One subject in three views of 8 x 6 pixels.
     assert {event.value for event in found.Scalars("work/train/gaussians")} == {144.0}
     # Terms are logged unweighted, and the total is their weighted sum.
     terms = [found.Scalars(f"loss/{name}") for name in ("total", "render_l1", "chamfer")]
     for total, l1, chamfer in zip(*terms, strict=True):
         assert total.value == pytest.approx(0.8 * l1.value + chamfer.value, rel=1e-5)
-    assert subject.renderer is flat_renderer  # no wrapper or hook remains
-    assert not subject.model.encoder._forward_hooks
 
 
-def test_pictures_and_clouds(run):
-    """Pictures and point clouds, with all points of the body, are logged at each validation."""
-    folder, _ = run
-    found = events(folder / "tensorboard")
+def test_pictures(run):
+    """Pictures are logged at each validation."""
+    found = events(run / "tensorboard")
     steps = [e.step for e in found.Scalars("val/psnr")]
     assert [e.step for e in found.Images("view/sheet/p0")] == steps == [4, 8]
-    assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["step_000004", "step_000008"]
-    clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
-    kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
-    assert {"points", "body", "points_and_body"} <= {kind.rstrip("_") for kind in kinds}
-    vertices = found.Tensors("p0/body_VERTEX")
-    assert [e.step for e in vertices] == steps
-    assert list(vertices[0].tensor_proto.tensor_shape.dim)[1].size == 20
+    assert sorted(path.name for path in (run / "pictures").iterdir()) == ["step_000004", "step_000008"]
 
 
 def test_the_session_says_what_the_run_is_and_that_it_ended(run):
     """The HParams tab shows a run's settings, final metric and success."""
-    folder = run[0] / "tensorboard"
+    folder = run / "tensorboard"
     start = hparams(folder, "_hparams_/session_start_info").session_start_info
     assert start.hparams["ablation"].string_value == "full"
     assert start.hparams["lr"].number_value == 0.1

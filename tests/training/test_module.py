@@ -242,23 +242,3 @@ def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
     subject = GHGSModule(Half(), flat_renderer, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
     (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
     assert found["val/depth_error_mm"] == pytest.approx(50, abs=0.01)  # the truth is 2.1 m
-
-
-def test_rounds_are_measured_as_the_result_is(tmp_path):
-    """Renderings of the Gaussians before each round are clamped, too, and their depths are those before
-    it."""
-
-    def brighter(gaussians, cameras):
-        drawn = flat_renderer(gaussians, cameras)
-        return dataclasses.replace(drawn, image=drawn.image + torch.linspace(-1, 2, drawn.image.shape[-1]))
-
-    class Twice(Standin):
-        def forward(self, batch):
-            found = super().forward(batch)
-            maps = DepthMaps(torch.full_like(found.depth, 2.2), batch.masks, torch.ones_like(found.depth))
-            return dataclasses.replace(found, drafts=(found.gaussians,), rounds=(maps, found.depth_maps))
-
-    subject = GHGSModule(Twice(), brighter, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
-    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
-    assert found["val/psnr_before_round_1"] == pytest.approx(found["val/psnr"], rel=1e-6)
-    assert found["val/depth_error_mm_before_round_1"] == pytest.approx(100, abs=0.01)

@@ -13,7 +13,6 @@ import torch
 from ghgs_lit.config import build, registry, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.callbacks import AveragingOptions
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume
 from tests.helpers.models import config, load_model, make_model, predict
@@ -131,35 +130,6 @@ def test_a_run_goes_on_with_them(tmp_path):
     other = GHGSModule(Standin(), flat_renderer, lambda *_: None, Optimization())
     with pytest.raises(InputError, match=r"last\.ckpt: losses\.log_variance: expected weights of model"):
         check_resume(path, other, settings)
-
-
-def test_the_average_is_of_all_weights(tmp_path):
-    """Lightning's average of model and loss equals one computed here."""
-    subject, seen = module(), Seen()
-    run = trainer(tmp_path, 4, AveragingOptions(decay=0.75).build(), seen)
-    run.fit(subject, StepData())
-    expected = seen.weights[0]
-    for step in seen.weights[1:]:
-        expected = {name: 0.75 * value + 0.25 * step[name] for name, value in expected.items()}
-    for name, value in subject.named_parameters():
-        torch.testing.assert_close(value.detach(), expected[name], msg=name)
-    assert not torch.equal(subject.losses.mixing, seen.weights[-1]["losses.mixing"])
-
-
-def test_a_run_with_an_average_goes_on(tmp_path):
-    """A run resumed in the middle ends with an equal average, bit for bit."""
-
-    middle = tmp_path / "two.ckpt"
-    results = []
-    for path in (None, middle):
-        subject = module()
-        saving = [Save(middle, 2)] if path is None else []
-        average = AveragingOptions(decay=0.75).build()
-        trainer(tmp_path, 4, average, *saving).fit(subject, StepData(), ckpt_path=path)
-        assert average._average_model.n_averaged == 4
-        results.append(subject)
-    for name, value in results[0].named_parameters():
-        assert torch.equal(value, dict(results[1].named_parameters())[name]), name
 
 
 def test_a_checkpoint_brings_the_loss_and_does_without_it(tmp_path, monkeypatch):

@@ -13,8 +13,8 @@ from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.callbacks import TrainingCost
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
-from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.loggers import CsvLog, TensorBoardLog, begin
 from ghgs_lit.training.start import check_resume, check_start
 from ghgs_lit.weights import frozen

@@ -9,8 +9,8 @@ from torch.utils.data import DataLoader
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.callbacks import TrainingCost
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
-from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.trainer import TrainerOptions
 from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model

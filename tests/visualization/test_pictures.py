@@ -1,4 +1,4 @@
-"""Sheets: the content of each row; point clouds."""
+"""Sheets: the content of each row."""
 
 import dataclasses
 
@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from ghgs_lit.types import Targets
-from ghgs_lit.visualization.pictures import clouds, row, sheet, to_uint8
-from tests.helpers.models import make_model, predict
+from ghgs_lit.visualization.pictures import row, sheet, to_uint8
 from tests.helpers.scenes import make_batch
 
 
@@ -53,24 +52,3 @@ def test_many_targets_make_no_endless_column():
         below = len(picture) - len(sheet(batch, None))
         assert below in range(rows * height, rows * (height + 2 * 16))
         assert picture.shape[1] == max(tiles * (width + 2) - 2, 3 * 142 - 2)
-
-
-def test_clouds_are_the_subjects_points_and_its_body():
-    """Clouds belong to one subject, keep their colours and respect the limit."""
-    model, batch = make_model().eval(), make_batch(2, 3)
-    body = [torch.rand(9, 3), torch.rand(4, 3)]
-    batch = dataclasses.replace(batch, body_vertices=body)
-    with torch.no_grad():
-        prediction = predict(model, batch)
-    found = clouds(batch, prediction, 1, limit=50)
-    assert list(found) == ["points", "body", "points_and_body"]
-    positions, colors = found["points"]
-    assert 25 < len(positions) <= 50
-    assert positions.shape == colors.shape
-    valid = prediction.points.valid[1] & batch.masks[1]
-    assert torch.equal(positions[0], prediction.points.pixels[1][valid][0])
-    assert torch.equal(colors[0], batch.images[1].movedim(1, -1)[valid][0])
-    assert torch.equal(found["body"][0], body[1])
-    assert len(found["points_and_body"][0]) == len(positions) + 4
-    nothing = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), body_vertices=None)
-    assert clouds(nothing, prediction, 0) == {}

@@ -135,11 +135,6 @@ class GaussianHead(nn.Module):
             nn.init.zeros_(header[-1].weight)
             nn.init.zeros_(header[-1].bias)
 
-    @property
-    def has_offset_limit(self) -> bool:
-        """Whether offsets are limited; never with the release's attributes."""
-        return self.attributes is not release_attributes and self.options.offset_limit is not None
-
     def forward(
         self,
         tokens: Tokens,

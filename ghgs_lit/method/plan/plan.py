@@ -108,16 +108,14 @@ class Plan:
         return _of_elements(self.extents, self.views)
 
     def trim(self, prediction: Prediction) -> Prediction:
-        """Remove Gaussians (also of the rounds' drafts) that pad a shape bucket.
+        """Remove Gaussians that pad a shape bucket.
 
         On a GPU, Gaussians of pixels with a depth that is not finite remain, with opacity 0."""
         counts = self.counts
         if self.sizes is None or prediction.gaussians.splits != (self.sizes.pixels,) * len(counts):
             return prediction
         index = slice(0, counts[0]) if len(counts) == 1 else true_places(self.subject.real, sum(counts))
-        every = (prediction.gaussians, *prediction.drafts)
-        gaussians, *drafts = (each.select(index, counts) for each in every)
-        return dataclasses.replace(prediction, gaussians=gaussians, drafts=tuple(drafts))
+        return dataclasses.replace(prediction, gaussians=prediction.gaussians.select(index, counts))
 
     @property
     def is_bucket(self) -> bool:

@@ -69,20 +69,18 @@ class State:
         return dataclasses.replace(self, gaussians=gaussians)
 
 
-def prediction_of(states: Sequence[State], keeps_drafts: bool, tokens: Tokens) -> Prediction:
+def prediction_of(states: Sequence[State], tokens: Tokens) -> Prediction:
     """Build the prediction of the last state.
 
     Args:
         states: states before the first round and after each.
-        keeps_drafts: include the Gaussians before each round.
         tokens: tokens of the encoder.
     """
     last = states[-1]
     maps = tuple(state.depth_maps for state in states)
-    drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
     depth = maps[-1].depth
     valid = maps[-1].valid
-    return Prediction(last.gaussians, depth, valid, last.points, maps[-1], maps, drafts, tokens)
+    return Prediction(last.gaussians, depth, valid, last.points, maps[-1], maps, tokens)
 
 
 #: Gaussians from raw attributes at points: ``GaussianHead.activate``.

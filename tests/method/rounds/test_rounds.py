@@ -20,7 +20,6 @@ RECURRENT = ("model=recurrent", "skip=exact", "rounds.hidden=16", "rounds.depths
 
 def model(*overrides, kick=0.0, seed=0):
     found = make_model(*RECURRENT, *overrides, seed=seed).eval()
-    found.keeps_drafts = True
     if kick:
         torch.nn.init.normal_(found.rounds.change[-1].weight, std=kick)
         torch.nn.init.normal_(found.rounds.exchange.hear.weight, std=kick)
@@ -37,8 +36,6 @@ def test_untrained_rounds_change_nothing():
     for name in ATTRIBUTES:
         assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
     assert len(found.rounds) == 3
-    assert len(found.drafts) == 2
-    assert not predict(model("rounds.gains=false").train(), batch).drafts  # nothing reads them
     assert torch.equal(found.depth, found.rounds[-1].depth)
 
 
@@ -135,9 +132,6 @@ def test_what_padding_added_is_cut_off_every_round():
         found = predict(model("model.pad=multiple", "model.frame=world", kick=0.1), batch)
     assert torch.equal(found.rounds[-1].depth, found.depth)
     assert {maps.depth.shape for maps in found.rounds} == {batch.masks.shape}
-    assert found.drafts
-    for draft in found.drafts:
-        assert torch.equal(draft.pixel, found.gaussians.pixel)
 
 
 def test_each_round_changes_half_as_much_as_the_one_before():
