@@ -12,14 +12,12 @@ are counted where seeds dominate, which is the worst case for a pooled variance.
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from ghgs_lit.evaluation.tables.significance import compare, holm, pool, smallest_difference
+from ghgs_lit.evaluation.tables.significance import ALPHA, compare, holm, pool, smallest_difference
 
-ALPHA = 0.05
 SUBJECTS = 20
 DEVIATION = 0.1
 """Deviation of a row over seeds, dB; for power, also of its interactions with subjects and of the rest."""
@@ -56,11 +54,11 @@ def mark_rows(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float
     """Whether each row but the first is marked against it, and the mean of the smallest differences."""
     shared = None if way == "pairs" else pool(rows)
     if way == "plain":
-        shared = replace(shared, rows=2)
-    comparisons = [compare(row, rows[0], ALPHA, shared) for row in rows[1:]]
+        shared = shared._replace(rows=2)
+    comparisons = [compare(row, rows[0], shared) for row in rows[1:]]
     others = [1.0] * (2 * len(comparisons)) if way == "pairs" else []
     corrected = holm([comparison.p for comparison in comparisons] + others)
-    smallest = [smallest_difference(each, ALPHA, len(corrected)) for each in comparisons]
+    smallest = [smallest_difference(each, len(corrected)) for each in comparisons]
     return [p < ALPHA for p in corrected[: len(comparisons)]], float(np.mean(smallest))
 
 

@@ -69,7 +69,7 @@ def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.devi
     def untrained() -> Predictor:
         return Predictor(GHGS.from_config(run.plain).to(device).eval())
 
-    return {name: baseline(name, renderer, untrained, run.per_scene) for name in names}
+    return {name: baseline(name, renderer, untrained, run.per_scene.steps) for name in names}
 
 
 def _methods(run: "Evaluate", device: torch.device) -> tuple[dict[str, Method], dict[str, Any]]:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Measured, Training, Verb
-from ghgs_lit.config.nodes import Check, PairedTest, PerScene, Texts, Timing
+from ghgs_lit.config.nodes import Check, PerScene, Texts, Timing
 from ghgs_lit.config.options import Count, PathText, Seed, Text, Words, Workers
 
 
@@ -68,7 +68,7 @@ class Evaluate(Measured):
     refine: int = Field(0, ge=0, le=10000)
     """Optimization steps towards the input views after each prediction; 0: none."""
     baselines: Texts = ()
-    """Baselines, from black, nearest_view, body_depth, hull, photo_depth, true_depth, per_scene,
+    """Baselines, from black, nearest_view, hull, photo_depth, true_depth, per_scene,
     untrained; or all."""
     per_scene: PerScene = PerScene()
     """3D Gaussian splatting optimized on each subject's input views."""
@@ -127,18 +127,16 @@ class Table(Verb):
     """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF
     methods | table4: the paper's ablation."""
     columns: Texts | None = None
-    """Metrics, such as [psnr_box, ssim_box]; null: psnr, ssim, lpips (flip where a run lacks lpips)."""
+    """Metrics, such as [psnr_box, ssim_box], of which the first is tested for significance; null: psnr,
+    ssim, lpips (flip where a run lacks lpips)."""
     by: Texts = ()
     """Configuration keys whose values get separate rows, such as [optimizer.lr]."""
-    subjects: Text | None = None
-    """Regular expression; only subjects whose whole name matches are included, such as a.* (people in
-    action); null: all."""
     others: PathText | tuple[PathText, ...] = ()
     """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
     reported: bool = True
     """Also print the numbers reported in the paper (not with layout=ablation)."""
-    test: PairedTest = PairedTest()
-    """Significance test between rows."""
+    unit: Text | None = None
+    """Where subjects are frames of people: regular expression whose group matches the person's name."""
 
 
 class Prepare(Verb):

@@ -87,22 +87,6 @@ class Check(Options):
     cameras."""
 
 
-class PairedTest(Options):
-    """Paired significance test between rows, over seeds and subjects together."""
-
-    group = "test"
-    against: Literal["full", "best", "none"] = "full"
-    """Reference: full: the row of the complete method | best: the best row of each column | none: no
-    test."""
-    alpha: float = Field(0.05, gt=0, lt=1)
-    """Significance level."""
-    metrics: Texts | None = None
-    """Tested columns, corrected for multiple testing together; null: the first. Other columns are only
-    printed."""
-    unit: Text | None = None
-    """Where subjects are frames of people: regular expression whose group matches the person's name."""
-
-
 class EvaluationOptions(Options):
     """Evaluation after training and by ``ghgs evaluate``: every number of views with every target
     protocol."""

@@ -1,18 +1,16 @@
 """Baselines: alternatives to a trained model, and simple methods that a model must beat."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ghgs_lit.config import nodes
 from ghgs_lit.errors import InputError, require_choice
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
 from ghgs_lit.geometry.masks import coverage, surface_colors, with_matte
-from ghgs_lit.geometry.projection import focal_lengths, unproject_maps, world_to_camera
+from ghgs_lit.geometry.projection import focal_lengths, unproject_maps
 from ghgs_lit.geometry.rotations import rotate
 from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.ops.activation import surface_axes
@@ -167,27 +165,6 @@ def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
     )
 
 
-def body_depth(batch: Batch) -> Tensor:
-    """Mean depth of the body's vertices in each view.
-
-    Args:
-        batch: Body vertices and cameras are read.
-
-    Returns:
-        Depths [B, V, H, W], metres, constant in each view.
-
-    Raises:
-        InputError: The data has no bodies.
-    """
-    if batch.body_vertices is None:
-        raise InputError("baselines: body_depth expects body vertices in the data; found none")
-    means = [
-        world_to_camera(vertices.expand(len(cameras), -1, -1), cameras[:, None])[..., 2].mean(-1)
-        for vertices, cameras in zip(batch.body_vertices, batch.cameras.extrinsics, strict=True)
-    ]
-    return torch.stack(means)[..., None, None].expand(batch.masks.shape)
-
-
 def true_depth(batch: Batch) -> Tensor:
     """Ground-truth depth maps of the data.
 
@@ -235,42 +212,26 @@ SIGMA = 0.5
 OPACITY = 0.5
 
 
-@dataclass(frozen=True)
-class PerScene:
+def start_scene(batch: Batch) -> Gaussians:
+    """Initial Gaussians of ``per_scene``: isotropic ones for each pixel of the subject, at
+    :func:`photo_depth`."""
+    depth = photo_depth(batch)
+    return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
+
+
+def per_scene(batch: Batch, renderer: Renderer, steps: int) -> Estimate:
     """Per-scene 3D Gaussian splatting (Kerbl et al. 2023), fitted to the input views.
 
-    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of the subject
-    in each input view is more than the views determine.
+    None is added or pruned: one Gaussian for each pixel of the subject in each input view is more than
+    the views determine.
 
     Args:
+        batch: Images, masks and cameras are read.
         renderer: Renders input and target views.
         steps: Steps of the optimiser, at least 1.
     """
-
-    renderer: Renderer
-    steps: int
-
-    @property
-    def fitting(self) -> Refinement:
-        """Optimisation that fits the Gaussians."""
-        return Refinement(self.steps, self.renderer, CHANGES)
-
-    def begin(self, batch: Batch) -> Gaussians:
-        """Initial Gaussians.
-
-        Args:
-            batch: Images, masks and cameras are read.
-
-        Returns:
-            An isotropic Gaussian for each pixel of the subject.
-        """
-        depth = photo_depth(batch)
-        return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
-
-    def __call__(self, batch: Batch) -> Estimate:
-        gaussians = self.fitting(self.begin(batch), batch)
-        image = self.renderer(gaussians, batch.targets.cameras).image
-        return Estimate(image, gaussians=gaussians)
+    gaussians = Refinement(steps, renderer, CHANGES)(start_scene(batch), batch)
+    return Estimate(renderer(gaussians, batch.targets.cameras).image, gaussians=gaussians)
 
 
 def black(batch: Batch) -> Estimate:
@@ -308,7 +269,6 @@ def nearest_view(batch: Batch) -> Estimate:
 
 #: Baselines that render discs, with the function of their depths.
 DEPTH_OF = {
-    "body_depth": body_depth,
     "hull": hull_depth,
     "photo_depth": photo_depth,
     "true_depth": true_depth,
@@ -320,7 +280,7 @@ def baseline(
     name: str,
     renderer: Renderer,
     untrained: Callable[[], Callable[[Batch], Prediction]],
-    per_scene: nodes.PerScene,
+    steps: int,
 ) -> Method:
     """Build a baseline.
 
@@ -328,7 +288,7 @@ def baseline(
         name: One of ``BASELINES``.
         renderer: Renders Gaussians from the target cameras.
         untrained: Builds a predictor with random weights, for ``untrained``.
-        per_scene: Options of ``per_scene``.
+        steps: Steps of the optimiser of ``per_scene``, at least 1.
 
     Raises:
         InputError: There is no such baseline.
@@ -337,7 +297,7 @@ def baseline(
     if name in DEPTH_OF:
         return partial(render_discs, depth_of=DEPTH_OF[name], renderer=renderer)
     if name == "per_scene":
-        return PerScene(renderer, per_scene.steps)
+        return partial(per_scene, renderer=renderer, steps=steps)
     if name == "untrained":
         return ModelMethod(untrained(), renderer)
     return {"black": black, "nearest_view": nearest_view}[name]

@@ -14,7 +14,7 @@ from ghgs_lit.errors import require, require_choice
 from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.metrics.regions import box_of, grown, mean_inside, mean_over
+from ghgs_lit.metrics.regions import box_of, grown, mean_over
 
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
@@ -143,25 +143,10 @@ def ssim_map(
 
 
 def ssim(
-    image: Float[Tensor, "n c h w"],
-    target: Float[Tensor, "n c h w"],
-    padding: str = "valid",
-    region: Bool[Tensor, "n h w"] | None = None,
+    image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], padding: str = "valid"
 ) -> Float[Tensor, " n"]:
-    """Mean structural similarity.
-
-    Args:
-        image: renders.
-        target: images in [0, 1].
-        padding: as in :func:`ssim_map`.
-        region: pixels to average over, as far as the map covers them; None: all.
-
-    Returns:
-        The mean over channels and pixels of each image; nan if the region is empty.
-
-    Raises:
-        InputError: as :func:`ssim_map`."""
-    return mean_inside(ssim_map(image, target, padding).mean(1), region)
+    """Mean of :func:`ssim_map` over channels and pixels of each image."""
+    return ssim_map(image, target, padding).mean((1, 2, 3))
 
 
 def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:

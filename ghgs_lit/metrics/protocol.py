@@ -23,13 +23,13 @@ from ghgs_lit.metrics.functional import (
     squared_error,
     ssim_map,
 )
-from ghgs_lit.metrics.regions import DEPTH_STEP, EDGE, mean_inside, region_of
+from ghgs_lit.metrics.regions import DEPTH_STEP, EDGE, mean_over, region_of
 
 NETWORK = "vgg"
 
 _ALL = ("psnr", "ssim", "flip")
 #: Metrics of each region; SSIM and FLIP use windows, which thin regions do not fill.
-MEASURED = {"image": _ALL, "box": _ALL, "crop": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
+MEASURED = {"image": _ALL, "box": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
 #: Further metrics, and the region that enables each.
 FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
 
@@ -41,7 +41,6 @@ _REGIONS = {
         "psnr_box_40": f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask",
     },
     "subject": {"subject": "the pixels of the subject's mask in the target"},
-    "crop": {"crop": "1000/1024 of the height and 500/1024 of the width, around the mask's box"},
     "edge": {
         "edge": f"pixels at most {EDGE} rows and columns from the outline of the subject's mask, and from "
         f"steps of more than {DEPTH_STEP:.0%} of the true depth where known",
@@ -96,26 +95,24 @@ class MetricsOptions(Options):
     """Options of image metrics."""
 
     group = "metrics"
-    protocol: Literal["correct", "release", "files"] = "correct"
+    protocol: Literal["correct", "release"] = "correct"
     """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it
     was calibrated. release: as the authors' code: no clamp, SSIM padded with zeros, LPIPS on [0, 1].
-    files: as correct, but on renders and targets rounded to 8 bits, SSIM without padding. Reported
-    with every number."""
-    regions: tuple[Literal["image", "box", "subject", "crop", "edge"], ...] = (
+    Reported with every number."""
+    regions: tuple[Literal["image", "box", "subject", "edge"], ...] = (
         "image",
         "box",
         "subject",
         "edge",
     )
     """Regions in which PSNR, SSIM and FLIP are measured. image: all pixels; box: the mask's bounding
-    box (also PSNR at a common brightness); subject: the mask's pixels (without FLIP); crop: the window
-    around the box used by GHG and LIFe-GoM (1000 x 500 of 1024 x 1024); edge: the mask's outline and
-    edges of true depth (PSNR alone; also light outside the subject and sharpness inside)."""
+    box (also PSNR at a common brightness); subject: the mask's pixels (without FLIP); edge: the mask's
+    outline and edges of true depth (PSNR alone; also light outside the subject and sharpness inside)."""
     lpips: Literal["auto", "require", "off"] = "auto"
     """auto: skipped with a message if torchvision or its weights are missing; require: an error if they
     are; off: never computed."""
 
-    beside: Literal["correct", "release", "files"] | None = None
+    beside: Literal["correct", "release"] | None = None
     """A second protocol to measure as well; its name is appended to its metrics (psnr_correct)."""
 
     @property
@@ -126,7 +123,7 @@ class MetricsOptions(Options):
     @property
     def ssim_padding(self) -> str:
         """Padding of SSIM (:func:`ssim_map`)."""
-        return {"release": "zeros", "files": "valid"}.get(self.protocol, "reflect")
+        return "zeros" if self.is_release else "reflect"
 
     def build(self) -> "ImageMetrics":
         """Build the metrics; raises InputError as :class:`ImageMetrics` does."""
@@ -137,7 +134,7 @@ class ImageMetrics:
     """All metrics of a protocol.
 
     Names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with the suffix ``_box``,
-    ``_subject``, ``_crop`` or ``_edge`` for other regions (see :data:`MEASURED`; LPIPS for the whole
+    ``_subject`` or ``_edge`` for other regions (see :data:`MEASURED`; LPIPS for the whole
     image only), and those of :data:`FURTHER`.
 
     Attributes:
@@ -195,8 +192,7 @@ class ImageMetrics:
     def definitions(self) -> dict[str, str]:
         """Definition of each metric and region, to be stored with the numbers."""
         options = self.options
-        renders = {"release": "as they are", "files": "and targets in 8 bits"}
-        renders = renders.get(options.protocol, "clamped to [0, 1]")
+        renders = "as they are" if options.is_release else "clamped to [0, 1]"
         text = {
             "image": f"renders {renders}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
@@ -259,9 +255,6 @@ class ImageMetrics:
             One value per image for each name."""
         if not self.options.is_release:
             image = image.clamp(0, 1)
-        if self.options.protocol == "files":
-            image = (255 * image).round() / 255
-            target = (255 * target).round() / 255
         maps: dict[str, Tensor] = {}
         regions: dict[str, Tensor | None] = {}
         values = {}
@@ -278,7 +271,7 @@ class ImageMetrics:
                 maps[metric] = self._map(metric, image, target)
             if region not in regions:
                 regions[region] = region_of(mask, region or "image", depth)
-            mean = mean_inside(maps[metric], regions[region])
+            mean = mean_over(maps[metric], regions[region])
             values[name] = decibels(mean) if metric == "psnr" else mean
         return values
 

@@ -5,13 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import require_choice
-from ghgs_lit.geometry.masks import between, first_and_last
+from ghgs_lit.geometry.masks import between
 
-REGIONS = ("image", "box", "subject", "crop", "edge")
-CROP = (1000 / 1024, 500 / 1024)
-"""Height and width of the region ``crop`` relative to the image: 1000 x 500 of 1024 x 1024, as in
-published scripts of GHG and LIFe-GoM."""
 EDGE = 2
 """Largest distance from the subject's outline in the region ``edge``, in rows and columns."""
 DEPTH_STEP = 0.02
@@ -27,44 +22,9 @@ def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | No
     return torch.where(count > 0, total / count.clamp(min=1), torch.full_like(total, torch.nan))
 
 
-def mean_inside(
-    values: Float[Tensor, "n hh ww"], region: Bool[Tensor, "n h w"] | None
-) -> Float[Tensor, " n"]:
-    """:func:`mean_over` for maps without the image's border.
-
-    Args:
-        values: maps as large as the image, or smaller by the same border on opposite sides.
-        region: pixels of the image, cropped likewise; None: all.
-
-    Returns:
-        A mean per map; nan if the cropped region is empty."""
-    if region is not None:
-        top = (region.shape[1] - values.shape[1]) // 2
-        left = (region.shape[2] - values.shape[2]) // 2
-        region = region[:, top : top + values.shape[1], left : left + values.shape[2]]
-    return mean_over(values, region)
-
-
 def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
     """Bounding box of each mask, as a mask; empty if the mask is empty."""
     return between(mask.any(-1))[:, :, None] & between(mask.any(-2))[:, None, :]
-
-
-def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """Window of size :data:`CROP` centred on each mask's bounding box and shifted into the image, as a
-    mask; empty if the mask is empty."""
-
-    def span(hit: Bool[Tensor, "n k"], share: float) -> Bool[Tensor, "n k"]:
-        """Rows or columns of the window, given those that the mask touches."""
-        count = hit.shape[1]
-        side = round(share * count)
-        index = torch.arange(count, device=hit.device)
-        first, last = first_and_last(hit)
-        start = (first - (side - (last - first + 1)) // 2).clamp(0, count - side)[:, None]
-        return (index >= start) & (index < start + side) & hit.any(-1, keepdim=True)
-
-    height, width = CROP
-    return span(mask.any(-1), height)[:, :, None] & span(mask.any(-2), width)[:, None, :]
 
 
 def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
@@ -96,17 +56,9 @@ def region_of(
 
     Args:
         mask: of the subject.
-        name: one of :data:`REGIONS`.
-        depth: true z in metres, 0 where unknown, whose edges belong to ``edge``; None: unknown.
-
-    Raises:
-        InputError: the region is unknown."""
-    require_choice("region", name, REGIONS)
-    if name == "image":
-        return None
-    if name == "crop":
-        return crop_of(mask)
+        name: ``image``, ``box``, ``subject`` or ``edge``.
+        depth: true z in metres, 0 where unknown, whose edges belong to ``edge``; None: unknown."""
     if name == "edge":
         outline = grown(mask, EDGE) & grown(~mask, EDGE)
         return outline if depth is None else outline | grown(depth_edges(depth), EDGE - 1)
-    return box_of(mask) if name == "box" else mask
+    return {"image": None, "box": box_of(mask), "subject": mask}[name]

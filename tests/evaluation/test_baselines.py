@@ -8,7 +8,6 @@ import pytest
 import torch
 from PIL import Image
 
-from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline, nearest_view, splats_at
 from ghgs_lit.geometry.projection import project
@@ -25,7 +24,7 @@ def nothing(gaussians, cameras):
 
 
 def named(name, renderer):
-    return baseline(name, renderer, Standin, PerScene(steps=1))
+    return baseline(name, renderer, Standin, 1)
 
 
 @pytest.mark.parametrize("views", [3, 5])
@@ -72,21 +71,10 @@ def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
     assert torch.equal(first.colors[:seen], batch.images[0, 0].movedim(0, -1)[batch.masks[0, 0]])
 
 
-def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
-    """The depth is measured along the axis of each camera, not as a distance."""
-    batch = example_batch(subjects=1, views=3)
-    estimate = named("body_depth", nothing)(batch)
-    for v in range(3):
-        _, z = project(batch.body_vertices[0], batch.cameras.intrinsics[0, v], batch.cameras.extrinsics[0, v])
-        assert torch.allclose(estimate.depth[0, v], z.mean().expand(16, 16), atol=1e-5)
-
-
-@pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])
-def test_what_the_data_lacks_is_an_error(name, field):
+def test_what_the_data_lacks_is_an_error():
     """A baseline that the data cannot support is rejected, as is an unknown name."""
-    batch = dataclasses.replace(example_batch(), **{field: None})
-    with pytest.raises(InputError, match=name):
-        named(name, nothing)(batch)
+    with pytest.raises(InputError, match="true_depth"):
+        named("true_depth", nothing)(dataclasses.replace(example_batch(), depths=None))
     with pytest.raises(InputError, match="baselines"):
         named("white", nothing)
 

@@ -8,14 +8,15 @@ import torch
 from ghgs_lit.config import run_of
 from ghgs_lit.evaluation.baselines import (
     CHANGES,
-    PerScene,
     _average_in_window,
     discs_at,
     hull_bounds,
     hull_depth,
+    per_scene,
     photo_depth,
     render_discs,
     splats_at,
+    start_scene,
     true_depth,
 )
 from ghgs_lit.geometry.masks import with_matte
@@ -155,9 +156,8 @@ def scene(views=4, size=42):
 def test_the_photographs_are_fitted():
     """Steps improve the render of an input by far more than refinement may."""
     batch = scene()
-    method = PerScene(RENDERER, steps=40)
-    begin = RENDERER(method.begin(batch), batch.targets.cameras).image
-    fitted = method(batch)
+    begin = RENDERER(start_scene(batch), batch.targets.cameras).image
+    fitted = per_scene(batch, RENDERER, steps=40)
     before, after = (psnr(i[0].clamp(0, 1), batch.targets.images[0]).item() for i in (begin, fitted.image))
     assert after > before + 8
     assert fitted.gaussians.splits == (int(batch.masks.sum()),)
@@ -167,11 +167,10 @@ def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
     """Gaussians start at photo-consistent depths; position, rotation, scale, opacity and colour all
     change."""
     batch = scene()
-    method = PerScene(RENDERER, steps=3)
-    begin = method.begin(batch)
+    begin = start_scene(batch)
     seen = int(batch.masks[0, 0].sum())
     _, depth = project(begin.means[:seen], batch.cameras.intrinsics[0, 0], batch.cameras.extrinsics[0, 0])
     assert torch.allclose(depth, photo_depth(batch)[0, 0][batch.masks[0, 0]], atol=1e-5)
-    fitted = method.fitting(begin, batch)
+    fitted = per_scene(batch, RENDERER, steps=3).gaussians
     for name in CHANGES:
         assert (getattr(fitted, name) != getattr(begin, name)).float().mean() > 0.5, name

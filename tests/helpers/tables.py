@@ -43,6 +43,8 @@ def write_run(
         provenance: Further provenance.
         config: Changes of the training's configuration; ``of_`` precedes ``views``, ``targets`` and ``data``.
     """
+    if psnr is None:
+        config = {"evaluation": {"views": [3, 4, 5]}, **config}
     config = config_of(row, seed, data, **{key.removeprefix("of_"): value for key, value in config.items()})
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
@@ -70,6 +72,4 @@ def write_run(
 
 def tables_of(folder: Path, layout="ablation", by=(), others=(), **options):
     """Build the tables of the runs below a folder."""
-    test = t.PairedTest(**options.pop("test", {}))
-    chosen = t.TableOptions(t.LAYOUTS[layout], test=test, **options)
-    return t.build_tables(t.read_sweep([folder], by), others, chosen)
+    return t.build_tables(t.read_sweep([folder], by), others, t.LAYOUTS[layout], **options)

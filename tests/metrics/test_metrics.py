@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from safetensors.torch import load_file
 from scipy.signal import convolve2d
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim
 from ghgs_lit.metrics.functional import ssim_map
-from ghgs_lit.metrics.regions import box_of, crop_of
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -88,47 +87,6 @@ def test_psnr_of_known_errors_by_region():
     assert psnr(image, target, mask).item() == pytest.approx(20 + 10 * np.log10(2), abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("box", "expected"),
-    [
-        (
-            (100, 900, 300, 500),
-            (0, 1000, 150, 650),
-        ),  # (1000 - 800) // 2 above, the rest below
-        ((110, 901, 301, 500), (6, 1006, 151, 651)),  # an odd side
-        ((200, 1020, 10, 120), (24, 1024, 0, 500)),  # at the lower and at the left border
-        ((2, 800, 900, 1000), (0, 1000, 524, 1024)),  # at the upper and at the right border
-    ],
-)
-def test_the_crop_is_that_of_published_scripts(box, expected):
-    """Sides of 1000 x 500 of 1024 x 1024, centred on the box and shifted into the image."""
-    mask = torch.zeros(2, 1024, 1024, dtype=torch.bool)
-    mask[0, box[0] : box[1], box[2] : box[3]] = True
-    crop, (top, bottom, left, right) = crop_of(mask), expected
-    assert crop[0].sum() == 1000 * 500
-    assert crop[0, top:bottom, left:right].all()
-    assert not crop[1].any()
-
-
-def test_files_are_measured_as_written(tmp_path):
-    """``metrics.protocol=files`` measures PSNR and SSIM of the 8-bit values that PNG files hold."""
-    image, target = (0.3 * i + 0.35 for i in _images(1, 64, 48))
-    mask = torch.zeros(1, 64, 48, dtype=torch.bool)
-    mask[:, 20:50, 20:31] = True
-    found = MetricsOptions(protocol="files", regions=("crop",), lpips="off").build()(image, target, mask)
-    read = []
-    for name, values in (("image", image), ("target", target)):
-        eighths = (255 * values[0].clamp(0, 1)).round().permute(1, 2, 0).numpy().astype(np.uint8)
-        Image.fromarray(eighths).save(tmp_path / f"{name}.png")
-        read.append(np.asarray(Image.open(tmp_path / f"{name}.png")) / 255)
-    rows, columns = slice(2, 64), slice(14, 37)  # 62 x 23 pixels, moved inside the image
-    expected = -10 * np.log10(np.mean((read[0] - read[1])[rows, columns] ** 2))
-    assert found["psnr_crop"].item() == pytest.approx(expected, abs=1e-4)
-    assert found["psnr_crop"] != psnr(image, target, crop_of(mask))
-    image, target = (torch.from_numpy(values).float().permute(2, 0, 1)[None] for values in read)
-    assert torch.allclose(found["ssim_crop"], ssim(image, target, "valid", crop_of(mask)), atol=1e-5)
-
-
 def test_equal_images_and_empty_regions_are_defined():
     """Equal images give the cap, and empty regions are left out of means."""
     image, _ = _images()
@@ -166,17 +124,6 @@ def test_ssim_of_images_below_the_window_is_padded_as_in_the_release(size):
     for padding in ("reflect", "valid"):
         with pytest.raises(InputError, match="ssim: expected images of at least 11x11"):
             ssim(image, target, padding)
-
-
-def test_ssim_of_a_region_is_the_mean_of_its_windows():
-    """A region's SSIM averages the windows centred in it; images that are too small are an error."""
-    image, target = _images(1)
-    region = torch.zeros(1, 30, 41, dtype=torch.bool)
-    region[0, 12, 20] = True
-    window = ssim(image[..., 7:18, 15:26], target[..., 7:18, 15:26])  # the one window centred there
-    assert ssim(image, target, "valid", region).item() == pytest.approx(window.item(), abs=1e-6)
-    with pytest.raises(InputError, match="at least 11x11"):
-        ssim(image[..., :10], target[..., :10])
 
 
 def test_flip_is_the_reference_implementation():

@@ -8,10 +8,17 @@ from itertools import combinations, product
 import pandas as pd
 
 from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
-from ghgs_lit.errors import InputError, require_choice
+from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of, paper
 from ghgs_lit.evaluation.tables.runs import TRAINING
-from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
+from ghgs_lit.evaluation.tables.significance import (
+    ALPHA,
+    Comparison,
+    compare,
+    holm,
+    pool,
+    smallest_difference,
+)
 from ghgs_lit.evaluation.tables.variants import ABSENT, describe, find_differences
 
 
@@ -44,10 +51,7 @@ def fill(table: Table) -> None:
     competing = cells["mean"].dropna().loc[lambda means: means.index.isin(competing, level="line")]
     for column, means in competing.groupby(CELL[1:]):
         _mark_best(table, means.round(metric_of(column[1]).decimals), metric_of(column[1]).arrow)
-    if table.options.test.against != "none":
-        for name in table.tested:
-            require_choice("test.metrics", name, tuple(table.metrics))
-        _test(table, _values_by_person(table, values), competing)
+    _test(table, _values_by_person(table, values), competing)
 
 
 def _values(table: Table) -> pd.DataFrame:
@@ -107,7 +111,7 @@ def _reported_figures(table: Table) -> pd.Series:
     for number, line in enumerate(table.lines):
         if line.variant.kind != "reported":
             continue
-        row = paper()["tables"][table.layout.reported]["rows"][line.variant.name]
+        row = paper()["tables"][table.layout.name]["rows"][line.variant.name]
         by_group = {data_title(key) if isinstance(key, str) else key: values for key, values in row.items()}
         for i, group in enumerate(table.groups):
             # The paper does not report the number of views of its Table 1.
@@ -120,7 +124,7 @@ def _missing_seeds(table: Table, measured: pd.Series) -> list[tuple[int, ...]]:
     """Seeds of planned runs without results that would fill each cell."""
     planned = defaultdict(set)
     for run, (number, group) in product(table.planned, enumerate(table.groups)):
-        if (run.views is None or group.views in run.views) and group.data in (None, data_title(run.data)):
+        if group.views in run.views and group.data in (None, data_title(run.data)):
             planned[run.variant, number].add(run.seed)
     lacking = []
     for (line, group, _), seeds in measured.items():
@@ -147,57 +151,46 @@ def _values_by_person(table: Table, values: pd.DataFrame) -> pd.DataFrame:
     """Values that can be tested, by cell and seed (index) and by person (columns)."""
     values = values[values["subject"].notna() & ~values["metric"].isin(TRAINING)]
     person = values["subject"]
-    if table.options.unit:
-        matches = [table.options.unit.fullmatch(name) for name in person]
+    if table.unit:
+        matches = [table.unit.fullmatch(name) for name in person]
         person = [match[1] if match else name for match, name in zip(matches, person, strict=True)]
     values = values.assign(person=person)
     return values.groupby([*CELL, "seed", "person"])["value"].mean().unstack("person")
 
 
 def _test(table: Table, people: pd.DataFrame, competing: pd.Series) -> None:
-    """Test each row against the reference of its column, corrected over all comparisons of the table.
+    """Test each row against the reference of its column in the first metric, corrected over all
+    comparisons of the table.
 
-    If the reference was chosen by its figures, every pair of rows of the column counts as a
-    comparison.
+    The reference is the row of the whole method, if there is exactly one; else the best, and every
+    pair of rows of the column counts as a comparison, since its figures chose it.
     """
-    alpha = table.options.test.alpha
     competing = competing[competing.index.isin(people.index.droplevel("seed"))]
+    tested = next((name for name in table.metrics if name not in TRAINING), "")
+    arrow = metric_of(tested).arrow
     tests: dict[tuple, Comparison] = {}
     unprinted = []
-    for column in product(range(len(table.groups)), table.tested):
-        means = competing[[cell[1:] == column for cell in competing.index]]
-        reference, is_chosen = _find_reference(table, means)
-        if reference is None:
+    for group in range(len(table.groups)):
+        means = competing[[cell[1:] == (group, tested) for cell in competing.index]]
+        full = [cell for cell in means.index if table.lines[cell[0]].variant.ablation == "full"]
+        is_chosen = len(full) != 1
+        if means.empty or (is_chosen and not arrow):
             continue
+        best = means.idxmin() if arrow == "↓" else means.idxmax()
+        reference = best if is_chosen else full[0]
         rows = {cell: people.loc[cell] for cell in means.index}
         pooled = pool(list(rows.values()))
         rest = [cell for cell in rows if cell != reference]
         for cell in rest:
-            tests[cell] = compare(rows[cell], rows[reference], alpha, pooled)
+            tests[cell] = compare(rows[cell], rows[reference], pooled)
         for pair in combinations(rest, 2) if is_chosen else ():
-            unprinted.append(compare(*(rows[cell] for cell in pair), alpha, pooled).p)
+            unprinted.append(compare(*(rows[cell] for cell in pair), pooled).p)
     known = [cell for cell, test in tests.items() if test.p is not None]
     corrected = holm([tests[cell].p for cell in known] + [p for p in unprinted if p is not None])
     table.comparisons = len(corrected)
     for cell, p in zip(known, corrected, strict=False):
-        smallest = smallest_difference(tests[cell], alpha, len(corrected))
+        smallest = smallest_difference(tests[cell], len(corrected))
         tests[cell] = replace(tests[cell], corrected=p, smallest=smallest)
-        table.cells.at[cell, "marked"] = p < alpha
+        table.cells.at[cell, "marked"] = p < ALPHA
     for cell, test in tests.items():
         table.cells.at[cell, "test"] = test
-
-
-def _find_reference(table: Table, means: pd.Series) -> tuple[tuple | None, bool]:
-    """The cell that the others of a column are compared with, and whether it was chosen by its
-    figures.
-
-    With ``test.against=full`` it is the row of the whole method, if there is exactly one; else the
-    best. None: the column has no reference.
-    """
-    full = [cell for cell in means.index if table.lines[cell[0]].variant.ablation == "full"]
-    if table.options.test.against == "full" and len(full) == 1:
-        return full[0], False
-    arrow = metric_of(means.index[0][2]).arrow if len(means) else ""
-    if not arrow:
-        return None, False
-    return (means.idxmin() if arrow == "↓" else means.idxmax()), True

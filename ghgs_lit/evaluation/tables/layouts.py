@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.runs import Planned
 from ghgs_lit.evaluation.tables.variants import Variant
 from ghgs_lit.parsing import read_yaml
@@ -54,54 +53,26 @@ class Layout(NamedTuple):
     """Rows and groups of columns of a table.
 
     Attributes:
-        name: Name of the layout in ``ghgs table``.
+        name: Name of the layout in ``ghgs table``, and of the paper's table whose figures are printed
+            next to the measured ones, if there is one.
         rows: ``ablation`` (all four combinations) or ``methods``.
         columns: One group for each of ``views`` or ``data``.
         views: Numbers of input views in the table.
-        heading: Heading of each group: ``views``, ``data`` or ``none``.
-        reported: The paper's table whose figures are printed next to the measured ones; None: none.
     """
 
     name: str
     rows: str
     columns: str
     views: tuple[int, ...]
-    heading: str
-    reported: str | None = None
 
 
 LAYOUTS = {
-    "ablation": Layout("ablation", "ablation", "views", (3, 4, 5), "views"),
-    "table1": Layout("table1", "methods", "data", (4,), "data", "table1"),
-    "table2": Layout("table2", "methods", "views", (3, 4, 5), "views", "table2"),
-    "table3": Layout("table3", "methods", "views", (4,), "none", "table3"),
-    "table4": Layout("table4", "ablation", "views", (4,), "data", "table4"),
+    "ablation": Layout("ablation", "ablation", "views", (3, 4, 5)),
+    "table1": Layout("table1", "methods", "data", (4,)),
+    "table2": Layout("table2", "methods", "views", (3, 4, 5)),
+    "table3": Layout("table3", "methods", "views", (4,)),
+    "table4": Layout("table4", "ablation", "views", (4,)),
 }
-
-
-@dataclass(frozen=True)
-class TableOptions:
-    """Content of a table.
-
-    Attributes:
-        layout: Rows and columns.
-        views: Numbers of input views; None: those of the layout.
-        targets: Target protocols; None: those of the runs.
-        metrics: Metrics; None: PSNR, SSIM and LPIPS, or FLIP where a run of a model has no LPIPS.
-        reported: Whether the paper's figures are printed where the layout has some.
-        test: Comparison of rows.
-        unit: Regular expression whose first group is the person, if subjects are frames of people.
-        subjects: Regular expression that matches the whole names of the selected subjects; None: all.
-    """
-
-    layout: Layout
-    views: tuple[int, ...] | None = None
-    targets: tuple[str, ...] | None = None
-    metrics: tuple[str, ...] | None = None
-    reported: bool = True
-    test: PairedTest = field(default_factory=PairedTest)
-    unit: re.Pattern[str] | None = None
-    subjects: re.Pattern[str] | None = None
 
 
 class Group(NamedTuple):
@@ -129,7 +100,7 @@ class Table:
     """A table, with everything that writers of all formats need.
 
     Attributes:
-        options: Content of the table.
+        layout: Rows and columns.
         rows: Measurements, as in :class:`ghgs_lit.evaluation.tables.runs.Sweep`.
         planned: Training runs of the table that have no results yet.
         configs: Configuration of our model by ``source``.
@@ -138,19 +109,17 @@ class Table:
         metrics: Names of the metrics of each group.
         lines: Rows of the table.
         left_out: Number of runs that are not in the table.
+        unit: Regular expression whose first group is the person, if subjects are frames of people.
         reported_on: Data of the reported figures, if any.
         cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over
             seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples,
             ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed),
             ``test`` (a :class:`ghgs_lit.evaluation.tables.significance.Comparison` or None),
             ``marked`` (significant).
-        tested: Names of the metrics that are tested.
         comparisons: Number of comparisons that are corrected together.
-        caption: Above the table.
-        notes: Below the table.
     """
 
-    options: TableOptions
+    layout: Layout
     rows: pd.DataFrame
     planned: list[Planned]
     configs: Mapping[str, Mapping[str, Any]]
@@ -159,16 +128,10 @@ class Table:
     metrics: list[str]
     lines: list[Line]
     left_out: int
+    unit: re.Pattern[str] | None = None
     reported_on: str | None = None
     cells: pd.DataFrame = field(default_factory=pd.DataFrame)
-    tested: list[str] = field(default_factory=list)
     comparisons: int = 0
-    caption: str = ""
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def layout(self) -> Layout:
-        return self.options.layout
 
     @property
     def is_ablation(self) -> bool:

@@ -1,17 +1,16 @@
-"""Runs as one frame: row of the table, setting, and metrics of each subject.
+"""Runs and results of other methods as frames: row of the table, setting, and metrics of each subject.
 
 A run is identified by its configuration, never by the name of its directory.
 """
 
-import itertools
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasPath, BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
@@ -20,9 +19,9 @@ from ghgs_lit.evaluation.tables.variants import (
     Variant,
     find_keys_of_rows,
     find_views_of_columns,
-    name_variants,
+    model_variant,
 )
-from ghgs_lit.parsing import read_yaml
+from ghgs_lit.parsing import read_json, read_yaml
 from ghgs_lit.runs.results import METHOD, read_results, validate
 from ghgs_lit.runs.run import runs_in_order
 
@@ -34,12 +33,11 @@ printed unit."""
 
 
 class Planned(NamedTuple):
-    """A training run without results: its row, data set, numbers of input views (None: unknown) and
-    seed."""
+    """A training run without results: its row, data set, numbers of input views and seed."""
 
     variant: Variant
     data: str
-    views: tuple[int, ...] | None
+    views: tuple[int, ...]
     seed: int
 
 
@@ -55,50 +53,29 @@ class Sweep:
             share a row and were each trained with a different one.
         planned: Training runs without results.
         configs: Configuration of our model by ``source``.
-        order: Variants of our models in the order of rows.
     """
 
     rows: pd.DataFrame
     planned: list[Planned]
     configs: dict[str, Mapping[str, Any]]
-    order: list[Variant]
 
 
-class _Strict(BaseModel):
+class _Provenance(BaseModel):
+    """Provenance of a ``metrics.json``, as far as tables need it."""
+
     model_config = ConfigDict(strict=True)
-
-
-class _Data(_Strict):
-    name: str
-    split: str
-
-
-class _Protocol(_Strict):
-    metrics: str
-
-
-class _Git(_Strict):
-    commit: str
-    changed: bool = False
-
-
-class _Training(_Strict):
-    steps: float | None = None
-    seconds: float | None = None
-    peak_bytes: float | None = None
-
-
-class _Provenance(_Strict):
     config: dict[str, Any]
     config_hash: str | None = None
     # Written by `ghgs evaluate`: the training's configuration, and its changes on the command line.
     checkpoint_config: dict[str, Any] | None = None
     changed_model: dict[str, Any] | None = Field(None, alias="model_config")
     seed: int | None = None
-    data: _Data
-    protocol: _Protocol
-    git: _Git | None = None
-    training: _Training | None = None
+    data: Annotated[str, Field(validation_alias=AliasPath("data", "name"))]
+    split: Annotated[str, Field(validation_alias=AliasPath("data", "split"))]
+    protocol: Annotated[str, Field(validation_alias=AliasPath("protocol", "metrics"))]
+    commit: str | None = Field(None, validation_alias=AliasPath("git", "commit"))
+    changed: bool = Field(False, validation_alias=AliasPath("git", "changed"))
+    training: dict[str, float | None] | None = None
 
 
 def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -121,12 +98,12 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     rows = rows.rename(columns={"seconds": "prediction_seconds"}).set_index(of_row).astype(float)
     rows = rows.groupby(level=of_row, sort=False).mean().dropna(axis="columns", how="all").reset_index()
     for name, (key, unit) in TRAINING.items():
-        value = getattr(source.training, key, None)
+        value = (source.training or {}).get(key)
         if value is not None:
             rows[name] = (rows["method"] == METHOD).map({True: value / unit})
-    git = source.git and source.git.commit[:9] + " with changes" * source.git.changed
+    git = source.commit and source.commit[:9] + " with changes" * source.changed
     about = {"seed": seed, "source": str(path), "run": source.config_hash, "git": git}
-    about |= {"data": source.data.name, "split": source.data.split, "protocol": source.protocol.metrics}
+    about |= {name: getattr(source, name) for name in ("data", "split", "protocol")}
     return rows.assign(**about), config
 
 
@@ -143,35 +120,25 @@ def _read_training(path: Path) -> dict[str, Any] | None:
     return config
 
 
-def natural_sort_key(text: str) -> list[str | float]:
-    """Sort key that compares numbers in texts by value: ``k=10`` comes after ``k=9``."""
-    parts = re.split(r"(\d+(?:\.\d+)?(?:e[-+]?\d+)?)", text)
-    return [float(part) if i % 2 else part for i, part in enumerate(parts)]
+def _find_runs(folders: Sequence[Path]) -> list[Path]:
+    """The ``metrics.json`` of each run, or the ``config.yaml`` of one without results: by folder, then in
+    the order of a sweep's command."""
+    commands = cache(runs_in_order)
 
+    def place(run: Path) -> tuple:
+        names = commands(run.parent)
+        return run.parent, names.index(run.name) if run.name in names else len(names), run
 
-def _sort_paths(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[str, Variant]) -> list[str]:
-    """Sort files of runs by folder, then as in the sweep's command, then by the names of their rows."""
-    commands = {sweep: runs_in_order(sweep) for sweep in {Path(path).parent.parent for path in paths}}
-
-    def place(path: str) -> tuple:
-        run = Path(path).parent
-        folder = [run.is_relative_to(folder) for folder in folders].index(True)
-        names = commands[run.parent]
-        number = names.index(run.name) if run.name in names else len(names)
-        return (
-            folder,
-            natural_sort_key(str(run.parent)),
-            number,
-            natural_sort_key(str(variants.get(path))),
-            natural_sort_key(path),
-        )
-
-    return sorted(paths, key=place)
-
-
-def _find_files(folders: Sequence[Path], name: str) -> list[Path]:
-    paths = itertools.chain.from_iterable(sorted(folder.rglob(name)) for folder in folders)
-    return [path for path in paths if path.parent.name != ".hydra"]
+    files: list[Path] = []
+    for folder in folders:
+        if not folder.is_dir():
+            found = "a file" if folder.is_file() else "none"
+            raise FileNotFoundError(f"{folder}: expected a directory of runs; found {found}")
+        runs = {path.parent for name in ("metrics.json", "config.yaml") for path in folder.rglob(name)}
+        for run in sorted((run for run in runs if run.name != ".hydra"), key=place):
+            measured = run / "metrics.json"
+            files.append(measured if measured.exists() else run / "config.yaml")
+    return files
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
@@ -187,45 +154,101 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         InputError: There is no finished run, a ``metrics.json`` is damaged, or no run has a key of
             ``by``.
     """
-    for folder in folders:
-        if not folder.is_dir():
-            found = "a file" if folder.is_file() else "none"
-            raise FileNotFoundError(f"{folder}: expected a directory of runs; found {found}")
-    runs = {str(path): _read_run(path) for path in _find_files(folders, "metrics.json")}
-    trainings = {str(path): _read_training(path) for path in _find_files(folders, "config.yaml")}
-    trainings = {path: config for path, config in trainings.items() if config is not None}
-    if not runs:
+    results: dict[str, pd.DataFrame] = {}
+    models: dict[str, Mapping[str, Any]] = {}
+    begun: dict[str, Mapping[str, Any]] = {}
+    known: set[str] = set()
+    for path in _find_runs(folders):
+        if path.name == "metrics.json":
+            results[str(path)], config = _read_run(path)
+            known |= flatten(config).keys()
+            if METHOD in set(results[str(path)]["method"]):
+                models[str(path)] = config
+        elif config := _read_training(path):
+            begun[str(path)] = config
+    if not results:
         names = ", ".join(map(str, folders))
-        begun = f"{len(trainings)} runs without one" if trainings else "none"
-        raise InputError(f"{names}: expected runs with a metrics.json below it; found {begun}")
-    models = {source: config for source, (rows, config) in runs.items() if METHOD in set(rows["method"])}
-    known = set().union(*(flatten(config) for _, config in runs.values()))
+        found = f"{len(begun)} runs without one" if begun else "none"
+        raise InputError(f"{names}: expected runs with a metrics.json below it; found {found}")
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
-    configs = {**models, **trainings}
+    configs = {**models, **begun}
     views = {} if TRAINING_COUNTS in by else find_views_of_columns(configs)
     for path in views:  # one row, whatever the number of views in training
         configs[path] = {**configs[path], "views": {**configs[path]["views"], "training_counts": "as many"}}
-    variants = name_variants(configs, list(dict.fromkeys([*by, *find_keys_of_rows(configs.values())])))
+    by = list(dict.fromkeys([*by, *find_keys_of_rows(configs.values())]))
+    variants = {path: model_variant(config, path, by) for path, config in configs.items()}
     frames = []
+    for path, rows in results.items():
+        if path in views:
+            rows = rows[(rows["method"] != METHOD) | (rows["views"] == views[path])]
+        variant = [variants[path] if name == METHOD else Variant("baseline", name) for name in rows["method"]]
+        trained_views = float(views.get(path, "nan"))
+        frames.append(rows.drop(columns="method").assign(variant=variant, trained_views=trained_views))
     planned = []
-    paths = _sort_paths({**runs, **trainings}, folders, variants)
-    for path in paths:
-        if path in runs:
-            rows = runs[path][0]
-            if path in views:
-                rows = rows[(rows["method"] != METHOD) | (rows["views"] == views[path])]
-            of_rows = [
-                variants[path] if name == METHOD else Variant("baseline", name) for name in rows["method"]
-            ]
-            trained_views = float(views.get(path, "nan"))
-            frames.append(rows.drop(columns="method").assign(variant=of_rows, trained_views=trained_views))
-        elif str(Path(path).with_name("metrics.json")) not in runs:
-            config = trainings[path]
-            counts = views.get(path, lookup(config, "evaluation.views"))
-            counts = (counts,) if isinstance(counts, int) else counts and tuple(counts)
-            planned.append(
-                Planned(variants[path], str(lookup(config, "data.name")), counts, config.get("seed", 0))
-            )
-    order = list(dict.fromkeys(variants[path] for path in paths if path in variants))
-    return Sweep(pd.concat(frames, ignore_index=True), planned, models, order)
+    for path, config in begun.items():
+        counts = views.get(path, lookup(config, "evaluation.views"))
+        counts = (counts,) if isinstance(counts, int) else tuple(counts)
+        data = str(lookup(config, "data.name"))
+        planned.append(Planned(variants[path], data, counts, config.get("seed", 0)))
+    return Sweep(pd.concat(frames, ignore_index=True), planned, models)
+
+
+_Text = Annotated[str, Field(min_length=1)]
+_Count = Annotated[int, Field(ge=1)]
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+    data: _Text
+    split: _Text
+    targets: _Text
+    protocol: _Text
+    views: _Count
+    seed: int = 0
+    subject: _Text | None = None
+    subjects: _Count | None = None
+    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
+
+
+class _Others(BaseModel):
+    """A results file of another method, in the format that ``docs/tables.md`` describes."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+    format: Literal["ghgs_lit.others"]
+    format_version: Literal[1]
+    method: _Text
+    source: _Text
+    rows: Annotated[list[_Row], Field(min_length=1)]
+
+
+def read_others(path: Path) -> pd.DataFrame:
+    """Read the results file of another method.
+
+    Args:
+        path: JSON file in the format of ``docs/tables.md``.
+
+    Returns:
+        Rows as in :class:`Sweep`. ``origin`` is the file's ``source``. Means have no ``subject``, and
+        optionally a ``count`` of subjects.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        InputError: It does not have the format; the message names the key.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
+    others = validate(_Others, read_json(path), path.name)
+    rows = pd.DataFrame([row.model_dump() for row in others.rows])
+    cell = [*SETTING, "views", "seed"]
+    repeated = rows.duplicated([*cell, "subject"])
+    if repeated.any():
+        at = f"{path.name}.rows[{repeated.idxmax()}]"
+        raise InputError(f"{at}: expected each subject once a setting; found one again")
+    means = rows["subject"].isna()
+    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
+        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
+    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
+    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
+    variant = Variant("other", others.method)
+    return rows.assign(variant=variant, source=str(path), run=None, origin=others.source).join(metrics)

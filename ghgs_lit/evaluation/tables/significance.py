@@ -11,12 +11,15 @@ are added (min F', Clark 1973), with the degrees of freedom of the smaller sampl
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 from scipy.optimize import brentq
 
+ALPHA = 0.05
+"""Significance level of all comparisons of a table together, and of single intervals."""
 POWER = 0.8
 """Power of the smallest difference that is printed below a table."""
 RATIO = 2.0
@@ -34,7 +37,7 @@ class Comparison:
         seeds: Number of seeds.
         subjects: Number of subjects.
         difference: Mean of row minus reference; None without pairs.
-        low: Lower end of its interval at level 1 - alpha, not corrected.
+        low: Lower end of its interval at level 1 - ``ALPHA``, not corrected.
         high: Upper end of that interval.
         p: Two-sided p-value.
         corrected: p-value after Holm's correction.
@@ -56,8 +59,7 @@ class Comparison:
     smallest: float | None = None
 
 
-@dataclass(frozen=True)
-class Pool:
+class Pool(NamedTuple):
     """Variance of a row over seeds, pooled over several rows.
 
     Attributes:
@@ -69,12 +71,6 @@ class Pool:
     variance: float
     freedom: int
     rows: int
-
-    @property
-    def allowance(self) -> float:
-        """Ratio of the largest possible variance of a difference to twice the pooled variance, if the
-        deviation of the reference is ``RATIO`` times that of the others; 1 for two rows."""
-        return (RATIO**2 + 1) * self.rows / (2 * (RATIO**2 + self.rows - 1))
 
 
 def pool(rows: Sequence[pd.DataFrame]) -> Pool:
@@ -104,14 +100,11 @@ def pool(rows: Sequence[pd.DataFrame]) -> Pool:
     return Pool(float(residuals @ residuals) / max(freedom, 1), freedom, len(set(row)))
 
 
-def compare(
-    row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05, pooled: Pool | None = None
-) -> Comparison:
+def compare(row: pd.DataFrame, reference: pd.DataFrame, pooled: Pool | None = None) -> Comparison:
     """Compare two rows of values.
 
     Args:
         row, reference: Values by seed (index) and subject (columns).
-        alpha: Level of the interval.
         pooled: Variance over seeds of all rows of the column; None: of these two (a paired t test).
     """
     row, reference = row.align(reference, join="inner")
@@ -125,28 +118,30 @@ def compare(
     both = [part[differences.columns] for part in (row, reference)]
     pooled = pooled if pooled and pooled.freedom else pool(both)
     freedom = min(pooled.freedom, subjects - 1)
-    over_seeds = 2 * pooled.allowance * pooled.variance / seeds
+    # Largest ratio of the variance of a difference to twice the pooled one, if the deviation of the
+    # reference is RATIO times that of the others; 1 for two rows.
+    allowance = (RATIO**2 + 1) * pooled.rows / (2 * (RATIO**2 + pooled.rows - 1))
+    over_seeds = 2 * allowance * pooled.variance / seeds
     error = math.sqrt(over_seeds + differences.mean().var() / subjects)
     errors = abs(mean) / error if error > 0 else math.inf if mean else 0.0
     p = float(2 * stats.t.sf(errors, freedom))
-    half = float(stats.t.isf(alpha / 2, freedom)) * error
+    half = float(stats.t.isf(ALPHA / 2, freedom)) * error
     return Comparison(seeds, subjects, mean, mean - half, mean + half, p, error=error, freedom=freedom)
 
 
-def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) -> float:
+def smallest_difference(comparison: Comparison, comparisons: int) -> float:
     """Difference that is significant with a probability of ``POWER``, by the noncentral t
     distribution.
 
     Args:
         comparison: With its standard error and degrees of freedom.
-        alpha: Level of all comparisons together.
         comparisons: Number of comparisons, at least 1.
 
     Returns:
         The difference, in the unit of the metric.
     """
     freedom = comparison.freedom
-    needed = stats.t.isf(alpha / 2 / comparisons, freedom)
+    needed = stats.t.isf(ALPHA / 2 / comparisons, freedom)
     errors = brentq(lambda errors: stats.nct.sf(needed, freedom, errors) - POWER, 0, 2 * needed + 10)
     return float(comparison.error * errors)
 
@@ -160,8 +155,6 @@ def holm(values: Sequence[float]) -> list[float]:
     Returns:
         Corrected p-values in the same order, at most 1.
     """
-    order = np.argsort(values, kind="stable")
-    scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)
-    corrected = np.empty(len(values))
-    corrected[order] = np.minimum(np.maximum.accumulate(scaled), 1)
-    return corrected.tolist()
+    ordered = pd.Series(values, dtype=float).sort_values(kind="stable")
+    scaled = ordered * np.arange(len(ordered), 0, -1)
+    return scaled.cummax().clip(upper=1).sort_index().tolist()

@@ -2,15 +2,13 @@
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import (
     EXPECTED_TO_DIFFER,
-    OF_A_PLACE,
-    OF_A_RUN,
     OF_TARGETS,
     OF_TRAINING,
     ablation_of,
@@ -22,22 +20,10 @@ from ghgs_lit.config.keys import (
 )
 from ghgs_lit.errors import require
 from ghgs_lit.parsing import read_yaml
-from ghgs_lit.runs.results import config_hash
 
 ABSENT = "absent"
 """Text for a key that a configuration does not have."""
 TRAINING_COUNTS = "views.training_counts"
-#: Titles of keys that distinguish rows without being named by the user.
-_KEY_TITLES = {
-    TRAINING_COUNTS: "trained with {} views",
-    "views.training": "input views in training: {}",
-    "targets.training_views": "target views in training: {}",
-    "targets.per_step": "targets a step: {}",
-    "targets.kind": "targets: {}",
-    "targets.view": "target view {}",
-    "targets.positions": "positions of targets: {}",
-    "targets.per_subject": "targets a subject: {}",
-}
 #: Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
 
@@ -76,7 +62,7 @@ class Variant:
     @property
     def titles(self) -> list[str]:
         """Differences of the row beyond model, encoder and ablation, in words."""
-        return [_KEY_TITLES.get(key, key + "={}").format(value.strip("[]")) for key, value in self.extra]
+        return [f"{key}={value}" for key, value in self.extra]
 
     @property
     def trained(self) -> tuple:
@@ -110,12 +96,6 @@ def encoder_name(config: Mapping[str, Any]) -> str:
     return "unnamed" + branch
 
 
-def ablation_sets(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted keys and values set by the chosen ablation of a training; empty if unknown."""
-    sets = lookup(config, "chosen.sets")
-    return dict(sets) if isinstance(sets, Mapping) else {}
-
-
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
     """The table row of a model.
 
@@ -137,13 +117,10 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     if model is None or model in _read_shipped("model"):
         model = str(lookup(config, "model.name") or "unnamed")
     model += f", compat {compat}" * (compat not in (None, "none"))
-    # A user-defined ablation is a row of the model's table, not another model. The paper's ablations
-    # find neighbours in 3D or on the image plane.
-    if is_custom_ablation(ablation):
-        if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
-            encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
-    elif recalibration.get("neighborhood") == "feature":
-        model += ", neighbours by feature"
+    # A user-defined ablation is a row of the model's table, not another model.
+    sets = lookup(config, "chosen.sets") or {}
+    if is_custom_ablation(ablation) and any(is_below(key, ["encoder"]) for key in sets):
+        encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
     extra = tuple((key, str(lookup(config, key))) for key in by)
     # Without such weights the encoder was trained by the rendering loss only.
     has_semantics = bool(lookup(config, "encoder.weights"))
@@ -179,21 +156,6 @@ def find_keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
         for place in places:
             values.setdefault(place, set()).add(str(lookup(config, place[0])))
     return [key for (key, *_), different in values.items() if len(different) > 1]
-
-
-def name_variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:
-    """Variants by file.
-
-    Models of equal configuration have one row, whatever their ablations are called; the paper's name
-    of the ablation precedes others.
-    """
-    variants = {path: model_variant(config, path, by) for path, config in configs.items()}
-    keys = {path: config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for path, config in configs.items()}
-    names: dict[str, str] = {}
-    for path, variant in variants.items():
-        if keys[path] not in names or not variant.is_own:
-            names[keys[path]] = variant.ablation
-    return {path: replace(variant, ablation=names[keys[path]]) for path, variant in variants.items()}
 
 
 def find_differences(

@@ -1,103 +1,192 @@
-r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
+r"""Writers of tables, with caption and notes: Markdown, CSV, and LaTeX in the paper's layout.
 
 LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
 
-import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
 from tabulate import tabulate
 
-from ghgs_lit.evaluation.tables.layouts import Table, data_title, metric_of
-from ghgs_lit.evaluation.tables.notes import MARK
+from ghgs_lit.evaluation.tables.layouts import Table, data_title, metric_of, paper
+from ghgs_lit.evaluation.tables.significance import ALPHA, POWER
+from ghgs_lit.evaluation.tables.variants import describe, find_differences
 
+MARK = r"\*"
+"""Mark of a significant difference, in Markdown."""
+_NO_SEMANTICS = "Features carry no semantics: the encoder was never trained for semantics."
+_TRAINED_VIEWS = (
+    "Each column shows the model that was trained with as many input views;"
+    " `by=[views.training_counts]` gives each model a row."
+)
+_MEANS = "Rows of other methods without subjects are not tested and are means of all their subjects."
+_NEIGHBORS = (
+    "**The switch of 3D unprojection hardly switches**: most neighbours of a token are the same with and"
+    " without it (`columns=[shared_neighbors]`), because recalibration.k is close to the number of tokens:"
+    " give a share, such as 0.1."
+)
+#: Share of equal neighbours above which the ablation of 3D unprojection hardly changes the method.
+_MOSTLY_SHARED = 0.8
+_STEPS = "Rows were trained for different numbers of steps: `columns=[psnr,steps]` shows them."
+_SEEDS = "Rows are of different seeds, which `table.csv` lists."
+_PARTIAL = "(2/3): from 2 of 3 seeds; the others have no results yet."
 COLUMNS = (
     "table", "kind", "method", "model", "encoder", "ablation", "unprojection", "semantic", "extra", "data",
     "split", "targets", "protocol", "views", "metric", "mean", "deviation", "seeds", "seeds_lacking",
-    "subjects", "selection", "best", "test_seeds", "test_subjects", "test_difference", "test_low",
-    "test_high", "test_p", "test_p_holm", "test_smallest", "runs",
+    "subjects", "best", "test_seeds", "test_subjects", "test_difference", "test_low", "test_high", "test_p",
+    "test_p_holm", "test_smallest", "runs",
 )  # fmt: skip
 NO_FIGURE = "-"
 """Text of a cell without a number, as in the paper."""
-BEST = " ◂"
-"""Mark of the best value in a terminal."""
-Write = Callable[[str, str, bool], str]
-"""Formats a cell from its number, the text after the number, and whether it is best."""
 
 
-def _format_cell(cell: Any, write: Write) -> str:
+def write_caption(table: Table) -> str:
+    """Caption of a table in one line of Markdown: data, subjects, protocol, model and number of
+    seeds."""
+    first = table.rows.iloc[0]
+    variant = first["variant"]
+    names = " and ".join(f"`{name}`" for name in dict.fromkeys(table.rows["data"]))
+    counts = " or ".join(map(str, sorted({int(count) for count in table.measured["count"]})))
+    parts = [
+        f"Data {names}",
+        f"{counts or 'no'} subject{'s' * (counts != '1')} of `{first['split']}`",
+        f"targets `{first['targets']}`",
+        f"metrics `{first['protocol']}`",
+    ]
+    if table.is_ablation:
+        parts += [f"model `{variant.model}`", f"encoder `{variant.encoder}`", *variant.titles]
+    views = ", ".join(str(count) for count in dict.fromkeys(group.views for group in table.groups))
+    parts.append(f"{views} input views")
+    spread = lead = ""
+    seeds = table.measured["seeds"].map(len)
+    if seeds.max() > 1:
+        spread = f" ± deviation over {_format_range(seeds)} seeds"
+        lead = " where it leads by more than the deviation"
+    return f"{', '.join(parts)}; mean over subjects{spread}, best of the measured methods in bold{lead}."
+
+
+def _format_range(values: pd.Series) -> str:
+    return " to ".join(map(str, dict.fromkeys((values.min(), values.max()))))
+
+
+def write_notes(table: Table) -> list[str]:
+    """Notes below a table that affect its interpretation, as paragraphs of Markdown."""
+    kinds = table.rows["variant"].map(lambda variant: variant.kind)
+    ours = table.rows[kinds == "model"]
+    others = table.rows[kinds == "other"]
+    by_row = ours.groupby("variant", sort=False)
+    shared = by_row["shared_neighbors"].mean().max() if "shared_neighbors" in ours else 0
+    applies = {
+        _NO_SEMANTICS: table.is_ablation and not ours["variant"].iloc[0].has_semantics,
+        _TRAINED_VIEWS: len(table.groups) > 1 and table.rows["trained_views"].nunique() > 1,
+        _MEANS: others["subject"].isna().any(),
+        _NEIGHBORS: table.is_ablation and shared > _MOSTLY_SHARED,
+        _STEPS: "steps" in ours and ours["steps"].nunique() > 1,
+        _SEEDS: by_row["seed"].agg(lambda seeds: tuple(sorted(set(seeds)))).nunique() > 1,
+        _PARTIAL: table.measured["lacking"].map(bool).any(),
+    }
+    notes = [note for note, holds in applies.items() if holds]
+    if table.reported_on:
+        notes.append(
+            f"† Reported: figures that {paper()['source']}, prints for {table.reported_on}, measured by its"
+            " authors. They are not comparable with figures on other data, splits, views or protocols."
+        )
+    notes += dict.fromkeys(f"{row.variant.name}: {row.origin}." for row in others.itertuples())
+    if table.left_out:
+        notes.append(f"Further runs in the folder, of other data, views or ablations: {table.left_out}.")
+    planned = [
+        f"{data_title(p.data)} {p.variant.model} {p.variant.ablation} seed {p.seed}" for p in table.planned
+    ]
+    if planned:
+        notes.append(f"No results yet (in progress or cut off): {'; '.join(dict.fromkeys(planned))}.")
+    notes += _describe_test(table)
+    if keys := _find_differences(table, ours):
+        notes.append(f"Runs side by side differ also in {describe(keys)}.")
+    states = sorted(table.rows["git"].dropna().unique())
+    if len(states) > 1:
+        notes.append(f"The runs are of {len(states)} states of the code: {', '.join(states)}.")
+    return notes
+
+
+def _find_differences(table: Table, ours: pd.DataFrame) -> dict[str, list[str]]:
+    """Keys in which runs of a row, or of all rows of ablations, differ, except for those in row names."""
+    shown = {"checkpoint"}
+    groups: dict[tuple, list] = {}
+    for source, rows in ours.groupby("source", sort=False):
+        variant = rows["variant"].iloc[0]
+        shown.update(key for key, _ in variant.extra)
+        row = (variant.model, variant.encoder, variant.ablation, rows["data"].iloc[0])
+        groups.setdefault(() if table.is_ablation else row, []).append(table.configs[source])
+    keys = {}
+    for group in groups.values():
+        keys |= find_differences(group)
+    return {key: values for key, values in keys.items() if key not in shown}
+
+
+def _describe_test(table: Table) -> list[str]:
+    """Meaning of the marks, and the smallest difference that the seeds and subjects could show."""
+    tests = table.cells["test"].dropna()
+    known = [test for test in tests if test.p is not None]
+    if not known:
+        lack = "subjects" if any(test.seeds > 1 for test in tests) else "seeds"
+        return [f"No differences are marked: rows have fewer than two {lack} in common."] * (len(tests) > 0)
+    models = [line.variant.ablation for line in table.lines if line.variant.kind == "model"]
+    against = "the row of the whole method" if models.count("full") == 1 else "its column's best row"
+    counts = pd.DataFrame(known)
+    metric = metric_of(tests.index[0][2])
+    return [
+        f"{MARK} {metric.title} differs beyond chance from {against} (p < {ALPHA:g} after Holm's"
+        f" correction over {table.comparisons} comparisons of {_format_range(counts['seeds'])} seeds and"
+        f" {_format_range(counts['subjects'])} subjects). In brackets the {1 - ALPHA:.0%} interval of the"
+        f" difference. A difference of {counts['smallest'].max():.{metric.decimals}f} is found with"
+        f" {POWER:.0%} power."
+    ]
+
+
+def _format_cell(cell: Any) -> str:
     """Format a cell: number, deviation over seeds, mark, interval of its difference, missing seeds."""
     if pd.isna(cell.mean):
-        return write("missing" if cell.lacking else NO_FIGURE, "", False)
+        return "missing" if cell.lacking else NO_FIGURE
     digits = metric_of(cell.Index[2]).decimals
-    tail = f" ± {cell.deviation:.{digits}f}" if pd.notna(cell.deviation) else ""
+    text = f"{cell.mean:.{digits}f}"
+    if cell.best:
+        text = f"**{text}**"
+    if pd.notna(cell.deviation):
+        text += f" ± {cell.deviation:.{digits}f}"
     if cell.marked:
-        tail += MARK
+        text += MARK
     if cell.test is not None and cell.test.low is not None:
         ends = [f"{end:+z.{digits}f}" for end in (cell.test.low, cell.test.high)]
-        tail += f" [{', '.join(ends)}]" if any(map(float, ends)) else ""  # no interval for equal rows
+        text += f" [{', '.join(ends)}]" if any(map(float, ends)) else ""  # no interval for equal rows
     if cell.lacking:
-        tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
-    return write(f"{cell.mean:.{digits}f}", tail, cell.best)
+        text += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
+    return text
 
 
-def _format_cells(table: Table, write: Write) -> pd.DataFrame:
-    """Formatted cells: a row for each line, columns by group and metric."""
-    cells = [_format_cell(cell, write) for cell in table.cells.itertuples()]
-    return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
-
-
-def _blocks(table: Table, write: Write) -> dict[str, list[tuple[str, list[str]]]]:
-    """Kind and cells of each line by the title of its block: reported lines, then measured ones."""
-    numbers = _format_cells(table, write)
-    blocks: dict[str, list[tuple[str, list[str]]]] = {}
-    for number, (variant, stub) in enumerate(table.lines):
-        is_reported = variant.kind == "reported"
-        title = f"as reported on {table.reported_on}, not measured here" if is_reported else "measured here"
-        blocks.setdefault(title, []).append((variant.kind, [*stub, *numbers.loc[number]]))
-    return blocks
+def _format(table: Table) -> pd.DataFrame:
+    """Texts of a table as Markdown: columns by title of the group and of the metric; first those that
+    name a row."""
+    texts = [_format_cell(cell) for cell in table.cells.itertuples()]
+    cells = pd.Series(texts, table.cells.index).unstack(["group", "metric"])
+    heads = [("", name) for name in table.stub]
+    for group, name in cells:
+        metric = metric_of(name)
+        heads.append((table.groups[group].title, f"{metric.title} {metric.arrow}".strip()))
+    rows = [[*line.stub, *cells.loc[number]] for number, line in enumerate(table.lines)]
+    return pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(heads))
 
 
 def to_markdown(table: Table) -> str:
     """Write the table as Markdown, with its caption above and its notes below."""
-
-    def write(number: str, tail: str, best: bool) -> str:
-        text = number + tail.replace(MARK, rf"\{MARK}")
-        return f"**{text}**" if best else text
-
-    width = len(table.groups) * len(table.metrics)
-    names = list(table.stub)
-    for group, metric in itertools.product(table.groups, map(metric_of, table.metrics)):
-        title = f"{metric.title} {metric.arrow}".strip()
-        names.append(f"{group.title} {title}" if table.layout.heading != "none" else title)
-    rows = []
-    for title, lines in _blocks(table, write).items():
-        if table.reported_on:
-            rows.append([f"*{title}*", *[""] * (len(names) - 1)])
-        rows += [cells for _, cells in lines]
-    align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * width
-    text = tabulate(rows, names, "pipe", colalign=align, disable_numparse=True)
-    notes = [rf"\{note}" if note.startswith(MARK + " ") else note for note in table.notes]
-    return "\n\n".join((table.caption, text, *notes)) + "\n"
-
-
-def to_terminal(table: Table) -> str:
-    """Write the table for a terminal, with caption and notes; each group of columns has its own
-    lines, which limits the width."""
-    numbers = _format_cells(table, lambda number, tail, best: number + tail + BEST * best)
-    rows = []
-    for (i, line), (number, group) in itertools.product(enumerate(table.lines), enumerate(table.groups)):
-        mark = "† " if line.variant.kind == "reported" else ""
-        rows.append([mark + line.stub[0], *line.stub[1:], group.title, *numbers.loc[i][number]])
-    names = [*table.stub, "", *(f"{metric.title} {metric.arrow}" for metric in map(metric_of, table.metrics))]
-    text = tabulate(rows, names, disable_numparse=True)
-    caption = table.caption.replace("in bold", f"marked{BEST}")
-    text = "\n\n".join((caption, text, *table.notes)) + "\n"
-    return text.replace("`", "").replace("**", "")
+    frame = _format(table)
+    names = [" ".join(head).strip() for head in frame]
+    align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub)
+    align += ["right"] * (len(names) - len(align))
+    text = tabulate(frame.to_numpy(), names, "pipe", colalign=align, disable_numparse=True)
+    return "\n\n".join((write_caption(table), text, *write_notes(table))) + "\n"
 
 
 def to_csv(tables: Sequence[Table]) -> str:
@@ -106,7 +195,7 @@ def to_csv(tables: Sequence[Table]) -> str:
     lines = []
     for number, table in enumerate(tables, 1):
         for cell in table.cells.itertuples():
-            lines.append({"table": number, **_describe_row(table, cell), **_figures(table, cell)})
+            lines.append({"table": number, **_describe_row(table, cell), **_figures(cell)})
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
@@ -121,7 +210,7 @@ def _describe_row(table: Table, cell: Any) -> dict[str, Any]:
     unprojection, semantic = variant.switches or (None, None)
     return {
         "kind": variant.kind,
-        "method": "ours" if table.is_ablation else stub[0],
+        "method": "ours" if table.is_ablation else variant.name if variant.kind == "reported" else stub[0],
         "model": variant.model,
         "encoder": variant.encoder,
         "ablation": variant.ablation,
@@ -135,19 +224,15 @@ def _describe_row(table: Table, cell: Any) -> dict[str, Any]:
     }
 
 
-def _figures(table: Table, cell: Any) -> dict[str, Any]:
+def _figures(cell: Any) -> dict[str, Any]:
     """Figures of a cell, by column of the CSV file; empty without a number."""
     if pd.isna(cell.mean):
         return {}
     figures = {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
     if isinstance(cell.seeds, tuple):  # measured, not reported
-        figures |= {
-            "seeds": " ".join(map(str, sorted(cell.seeds))),
-            "seeds_lacking": " ".join(map(str, cell.lacking)),
-            "subjects": cell.count,
-            "selection": table.options.subjects and table.options.subjects.pattern,
-            "runs": cell.runs,
-        }
+        figures["seeds"] = " ".join(map(str, sorted(cell.seeds)))
+        figures["seeds_lacking"] = " ".join(map(str, cell.lacking))
+        figures |= {"subjects": cell.count, "runs": cell.runs}
     if cell.test is not None:
         figures |= {f"test_{name}": value for name, value in asdict(cell.test).items()}
         figures["test_p_holm"] = cell.test.corrected
@@ -162,9 +247,12 @@ _FLOAT = r"""\begin{%(float)s}[t]
 \centering
 \small
 \begin{adjustbox}{max width=\linewidth}
-%(tabular)s
-\end{adjustbox}
-%(notes)s\caption{%(caption)s}
+%(tabular)s\end{adjustbox}
+\par\smallskip
+\parbox{\linewidth}{\footnotesize
+%(notes)s
+}
+\caption{%(caption)s}
 \label{%(label)s}
 \end{%(float)s}
 """
@@ -175,81 +263,30 @@ _ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "✓": r"\cmark{}", "✗": r"\xmark{}", "±": r"$\pm$",
-    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "°": r"$^\circ$", "†": r"$\dagger$",
+    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "°": r"$^\circ$", "†": r"$\dagger$", "★": "$^{*}$",
 }  # fmt: skip
 
 
-def escape(text: str) -> str:
-    """Escape plain text for LaTeX."""
-    return text.translate(str.maketrans(_ESCAPES))
-
-
 def markdown_to_latex(text: str) -> str:
-    """Convert Markdown with ``**bold**`` and names in backticks to LaTeX."""
-    text = re.sub(r"\*\*([^*]+)\*\*", r"\\textbf{\1}", escape(text))
+    """Convert Markdown with ``**bold**``, names in backticks and ``MARK`` to LaTeX."""
+    text = text.replace(MARK, "★").translate(str.maketrans(_ESCAPES))
+    text = re.sub(r"\*\*([^*]+)\*\*", r"\\textbf{\1}", text)
     return re.sub(r"`([^`]*)`", r"\\texttt{\1}", text)
-
-
-def _format_number(number: str, tail: str, best: bool) -> str:
-    number = rf"\textbf{{{number}}}" if best else escape(number)
-    return number + escape(tail).replace(MARK, "$^{*}$")
-
-
-def _columns(table: Table) -> str:
-    """Column specification: ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; data sets without
-    the first bar)."""
-    if table.is_ablation and len(table.groups) == 1:
-        return "c" * (len(table.stub) + len(table.metrics))
-    stub = " ".join("c" * len(table.stub)) if len(table.stub) > 1 else "l"
-    columns = " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
-    return columns.replace(" |", "", 1) if table.layout.columns == "data" else columns
-
-
-def _head(table: Table) -> list[str]:
-    """Rows of titles, with a rule below each group of columns."""
-    stub = list(map(escape, table.stub))
-    width = len(table.metrics)
-    metrics = []
-    for metric in map(metric_of, table.metrics):
-        metrics.append(escape(metric.title) + (f"({escape(metric.arrow)})" if metric.arrow else ""))
-    metrics *= len(table.groups)
-    if table.layout.heading == "none":
-        return [" & ".join([*stub, *metrics]) + r" \\"]
-    names = [rf"\multirow{{2}}{{*}}{{{name}}}" for name in stub]
-    rules = ""
-    for number, group in enumerate(table.groups):
-        names.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(group.title)}}}")
-        start = len(stub) + 1 + number * width
-        rules += rf"\cmidrule(lr){{{start}-{start + width - 1}}}"
-    return [" & ".join(names) + r" \\", rules, " & ".join([*[""] * len(stub), *metrics]) + r" \\"]
-
-
-def _tabular(table: Table) -> str:
-    """The ``tabular`` environment, with rules above blocks."""
-    rows = [rf"\begin{{tabular}}{{{_columns(table)}}}", r"\toprule", *_head(table)]
-    count = len(table.stub)
-    for title, lines in _blocks(table, _format_number).items():
-        rows.append(r"\midrule")
-        if table.reported_on:
-            title = rf"\multicolumn{{{len(lines[0][1])}}}{{l}}{{\emph{{{escape(title)}}}}} \\"
-            rows += [title, r"\midrule"]
-        for kind, cells in lines:
-            names = list(map(escape, cells[:count]))
-            if kind == "model" and not table.is_ablation:
-                names = [rf"\textbf{{{name}}}" for name in names]
-            rows.append(" & ".join([*names, *cells[count:]]) + r" \\")
-    return "\n".join([*rows, r"\bottomrule", r"\end{tabular}"])
 
 
 def to_latex(table: Table, label: str) -> str:
     """Write a float with the table, its caption, notes in small print, and label; requires
     ``PREAMBLE``."""
-    notes = "\n".join(rf"{markdown_to_latex(note)}\par" for note in table.notes)
+    frame = _format(table).map(markdown_to_latex)
+    frame.columns = frame.columns.map(lambda head: tuple(map(markdown_to_latex, head)))
+    stub = "c" if len(table.stub) > 1 else "l"
+    columns = "|".join([stub * len(table.stub)] + ["c" * len(table.metrics)] * len(table.groups))
+    style = frame.style.hide(axis="index")
     parts = {
-        "float": "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table",
-        "tabular": _tabular(table),
-        "notes": f"\\par\\smallskip\n\\parbox{{\\linewidth}}{{\\footnotesize\n{notes}\n}}\n" if notes else "",
-        "caption": markdown_to_latex(table.caption),
+        "float": "table*" if frame.shape[1] - len(table.stub) >= _WIDE else "table",
+        "tabular": style.to_latex(column_format=columns, hrules=True, multicol_align="c"),
+        "notes": "\n".join(rf"{markdown_to_latex(note)}\par" for note in write_notes(table)),
+        "caption": markdown_to_latex(write_caption(table)),
         "label": label,
     }
     return _FLOAT % parts

@@ -118,7 +118,6 @@ RUNS: dict[str, list[tuple]] = {
     ],
     "only_ablations": [("neither", 20.0, {})],
     "rivals": [("full", 20.0, {}), ("full", 21.0, {})],
-    "groups_of_subjects": [("full", 20.0 + 1 / 3, {"shifts": {"a_1": 0.0, "a_2": 2.0, "b_1": 7.0}})],
     "checkpoints": [
         ("full", 20.0, {"measured": {"checkpoint": "a.ckpt"}}),
         ("full", 21.0, {"measured": {"checkpoint": "b.ckpt"}}),
@@ -175,11 +174,6 @@ RUNS: dict[str, list[tuple]] = {
             },
         ),
     ],
-    "names_of_one": [
-        ("full", 21.0, {"seed": 1, "recalibration": neighbors(1), "chosen": chosen("mine")}),
-        ("full", 22.0, {"seed": 2, "recalibration": neighbors(1), "chosen": chosen("full")}),
-        ("full", 23.0, {"seed": 3, "recalibration": neighbors(1), "chosen": chosen("other")}),
-    ],
     "training": [
         ("full", 20.0, {"provenance": {"training": {"steps": 350, "seconds": 61.4, "peak_bytes": 2.5e9}}}),
         ("neither", 19.0, {"provenance": {"training": {"steps": 350, "seconds": 50.0}}}),
@@ -226,7 +220,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "settings": ("settings", PSNR),
     "midway": ("settings", {"targets": ("midway",), **PSNR}),
     "by_rate": ("rates", {"by": ("optimizer.lr",), **PSNR}),
-    "subjects": ("groups_of_subjects", {"subjects": re.compile("a_."), **PSNR}),
     "by_checkpoint": ("checkpoints", {**OURS, "by": ["checkpoint"]}),
     "views": ("views", OURS),
     "views_of_ablations": ("views", PSNR),
@@ -241,24 +234,17 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "odd_names": ("odd_names", {**OURS, "layout": "table3"}),
     "own_ablations": ("own", {"layout": "table4", **PSNR}),
     "own_methods": ("own", {**OURS, "layout": "table3"}),
-    "names_of_one": ("names_of_one", CLEAR),
     "by_neighbors": ("same_numbers", {"by": ["recalibration.k"], **CLEAR}),
     "training": ("training", {"views": (4,), "metrics": ("psnr", "steps", "seconds", "peak_gb")}),
     "near": ("near", CLEAR),
     "clear": ("clear", {"views": (4,)}),
-    "against_best": ("clear", {**CLEAR, "test": {"against": "best"}}),
-    "untested": ("clear", {**CLEAR, "test": {"against": "none"}}),
-    "all_tested": ("clear", {"views": (4,), "test": {"metrics": ["flip", "psnr", "ssim"]}}),
-    "lowest_is_best": ("low", {"metrics": ("lpips",), "test": {"against": "best", "metrics": "lpips"}}),
+    "lowest_is_best": ("low", {"metrics": ("lpips",)}),
     "people": ("frames", {**CLEAR, "unit": re.compile(r"(p\d)_\d+")}),
     "one_person": ("frames", {**CLEAR, "unit": re.compile(r"(p)\d_\d+")}),
     "one_seed": ("one_seed", CLEAR),
     "other_seeds": ("other_seeds", CLEAR),
     "other_methods": ("protocols", {"layout": "table2", "reported": False, "others": OTHERS}),
-    "others_selected": (
-        "protocols",
-        {**OURS, "others": OTHERS, "subjects": re.compile("a"), "targets": ("release",)},
-    ),
+    "others_selected": ("protocols", {**OURS, "others": OTHERS, "targets": ("release",)}),
 }
 CONFIGURATION = "one configuration for ablation=full, .*"
 #: Names of runs and options that are rejected, with the message.
@@ -278,11 +264,6 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("near", {"metrics": ("psnr_bx",)}, "columns: .* psnr, ssim, flip, shared_neighbors; found 'psnr_bx'"),
     ("rivals", {**OURS, "views": (9,)}, r"evaluation\.views: expected some of 3, 4, 5"),
     ("only_ablations", OURS, "runs of layout=table2; found .baselines or the paper"),
-    ("clear", {"test": {"metrics": "psnr_box"}}, r"test\.metrics: .* psnr, ssim, flip; found 'psnr_box'"),
-    ("near", {"test": {"against": "worst"}}, "test"),
-    ("near", {"test": {"alpha": 0}}, "test"),
-    ("groups_of_subjects", {"subjects": re.compile("a")}, "subjects: .* of the runs, such as a_1; found 'a'"),
-    ("reported", {**OTHER, "subjects": re.compile("a")}, r"subjects: .*others\.json, such as x; found 'a'"),
     (
         "reported",
         {**OTHER, "others": [other(protocol="release")]},

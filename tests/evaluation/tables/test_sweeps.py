@@ -98,7 +98,7 @@ def test_an_ablation_of_ones_own_is_trained_evaluated_and_printed(tmp_path, boxe
         assert list(rows) == ["neither", "no_unprojection", "no_semantic", "full", "one_neighbor"]
         assert float(rows["one_neighbor"]) == pytest.approx(sum(psnr) / len(psnr), rel=1e-6)
         assert (rows["neither"] == "", rows["full"] == "") == (True, False)
-        assert "`one_neighbor`: `recalibration.k=1`." in Path("table/table.md").read_text()
+        assert "differ also in `recalibration.k` (64, 1)" in Path("table/table.md").read_text()
     # The ablation of a checkpoint cannot be overridden.
     assert ghgs("evaluate", *common, *run, "ablation=full") == 1
     assert "ablation: expected one_neighbor, as the checkpoint was trained" in capsys.readouterr().err

@@ -20,10 +20,9 @@ from ghgs_lit.evaluation.tables import (
     to_csv,
     to_latex,
     to_markdown,
-    to_terminal,
 )
 from ghgs_lit.evaluation.tables.variants import encoder_name
-from ghgs_lit.evaluation.tables.writers import escape, markdown_to_latex
+from ghgs_lit.evaluation.tables.writers import markdown_to_latex
 from ghgs_lit.runs.results import config_hash, read_results, summarize, write_results
 from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, other, views
 from tests.helpers.tables import tables_of, write_run
@@ -32,7 +31,6 @@ EXPECTED = Path(__file__).parents[2] / "fixtures" / "tables"
 EXAMPLE = Path(__file__).parents[3] / "docs" / "example_others.json"
 WRITERS = {
     ".md": lambda tables: "\n".join(map(to_markdown, tables)),
-    ".txt": lambda tables: "\n".join(map(to_terminal, tables)),
     ".tex": lambda tables: "\n".join(to_latex(table, "table:x") for table in tables),
     ".csv": to_csv,
 }
@@ -78,14 +76,14 @@ def test_what_no_table_can_show_is_refused(runs, options, message, tmp_path):
 
 def test_text_of_all_kinds_is_escaped():
     """No name of a run or file can break the LaTeX."""
-    assert escape("a_b & 50% #1 {x} ^~\\ $") == (
+    assert markdown_to_latex("a_b & 50% #1 {x} ^~\\ $") == (
         r"a\_b \& 50\% \#1 \{x\} \textasciicircum{}\textasciitilde{}\textbackslash{} \$"
     )
     assert (
         markdown_to_latex("**No** `a_b` (✗, ✓) ± 1")
         == r"\textbf{No} \texttt{a\_b} (\xmark{}, \cmark{}) $\pm$ 1"
     )
-    assert markdown_to_latex("* differs, p < 0.05") == r"* differs, p \textless{} 0.05"
+    assert markdown_to_latex(r"\* differs, p < 0.05") == r"$^{*}$ differs, p \textless{} 0.05"
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX engine")
@@ -102,31 +100,28 @@ def test_latex_compiles(tmp_path):
     assert "Overfull" not in done.stdout
 
 
-@pytest.mark.parametrize("planned", [["c", "a", "b"], None])
-def test_rows_stand_in_the_order_of_the_command_else_in_that_of_numbers(tmp_path, planned):
+def test_rows_stand_in_the_order_of_the_command(tmp_path):
     """Names of folders, which are hashes, do not matter."""
     for name, rate in (("a", 10), ("b", 9), ("c", 0.25)):
         write_run(tmp_path / name, "full", 20.0, optimizer={"lr": rate})
-    if planned:
-        (tmp_path / "multirun.yaml").write_text(f"seed: 1\nruns: {planned}\n")
+    (tmp_path / "multirun.yaml").write_text("seed: 1\nruns: [c, a, b]\n")
     (table,) = tables_of(tmp_path, "table2", by=["optimizer.lr"], reported=False)
-    rates = ["0.25", "10", "9"] if planned else ["0.25", "9", "10"]
-    assert [line.stub for line in table.lines] == [(f"Ours (optimizer.lr={rate})",) for rate in rates]
+    assert [line.stub for line in table.lines] == [(f"Ours (optimizer.lr={r})",) for r in ("0.25", "10", "9")]
 
 
 @pytest.mark.parametrize(
-    ("key", "values", "title"),
+    ("key", "values"),
     [
-        ("views.training", ["any", "even"], "input views in training: {}"),
-        ("targets.training_views", [[0], [2, 3]], "target views in training: {}"),
-        ("targets.per_step", [1, 2], "targets a step: {}"),
-        ("targets.view", [2, 3], "target view {}"),
-        ("targets.per_subject", [1, "all"], "targets a subject: {}"),
+        ("views.training", ["any", "even"]),
+        ("targets.training_views", [[0], [2, 3]]),
+        ("targets.per_step", [1, 2]),
+        ("targets.view", [2, 3]),
+        ("targets.per_subject", [1, "all"]),
     ],
 )
 @pytest.mark.parametrize("seeds", [(1, 2), (1, 1)])
 @pytest.mark.parametrize("is_training", [True, False])
-def test_other_views_and_targets_are_other_rows(tmp_path, key, values, title, seeds, is_training):
+def test_other_views_and_targets_are_other_rows(tmp_path, key, values, seeds, is_training):
     """They change the model, or its protocol, as much as another learning rate does."""
     group, _, name = key.partition(".")
     for number, value in enumerate(values):
@@ -137,9 +132,7 @@ def test_other_views_and_targets_are_other_rows(tmp_path, key, values, title, se
         of = {f"of_{group}": node for group, node in nodes.items()}
         write_run(tmp_path / str(number), "full", 20.0 + number, seeds[number], measured=measured, **of)
     (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
-    assert [line.stub for line in table.lines] == [
-        (f"Ours ({title.format(str(value).strip('[]'))})",) for value in values
-    ]
+    assert [line.stub for line in table.lines] == [(f"Ours ({key}={value})",) for value in values]
     assert list(table.cells["mean"][:, 0, "psnr"]) == [23.0, 24.0]
 
 
@@ -239,11 +232,10 @@ PROVENANCE, ROW = "provenance", ("rows", 0)
         ("x", [PROVENANCE, "config"], "provenance.config: expected to be a valid dictionary; found 'x'"),
         (KeyError, [PROVENANCE, "config", "recalibration"], "recalibration: expected a mapping"),
         ("one", [PROVENANCE, "config", "seed"], "provenance.seed: expected a whole number; found 'one'"),
-        (KeyError, [PROVENANCE, "data"], "provenance.data: expected a value; found none"),
+        (KeyError, [PROVENANCE, "data"], "provenance.data.name: expected a value; found none"),
         (3, [PROVENANCE, "data", "split"], "provenance.data.split: expected to be a valid string; found 3"),
-        (None, [PROVENANCE, "protocol"], "provenance.protocol: expected to be a valid dictionary"),
-        ("dirty", [PROVENANCE, "git"], "provenance.git: expected to be a valid dictionary"),
-        (3, [PROVENANCE, "training"], "provenance.training: expected to be a valid dictionary .*found 3"),
+        (None, [PROVENANCE, "protocol"], "provenance.protocol.metrics: expected a value; found none"),
+        (3, [PROVENANCE, "training"], "provenance.training: expected to be a valid dictionary; found 3"),
         (
             "0" * 12,
             [PROVENANCE, "config_hash"],
