@@ -8,10 +8,11 @@ import lightning.pytorch as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Timer
-from torch import nn
+from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.training.guard import Guard, Step
 from ghgs_lit.training.optimization import Optimization, convert_rates_to_numbers, hold_rates
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
@@ -42,6 +43,7 @@ class BudgetedModule(L.LightningModule):
         self.optimization = optimization
         self.config = {**getattr(model, "config", {}), **(config or {})}
         self.used_budget = 0.0
+        self.guard = Guard(getattr(optimization, "skip_nonfinite", 0))  # a plug-in may lack this option
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Copy a batch to a device, without a synchronisation if its memory is pinned."""
@@ -110,23 +112,42 @@ class BudgetedModule(L.LightningModule):
             raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
         return min(max(shares), 1.0)
 
-    def log_numbers(self, size: int, **numbers: float) -> None:
-        """Log the learning rate, the used budget and further numbers of a step under ``train/``.
+    def log_step(self, step: Step, total: Tensor, terms: Mapping[str, Tensor], **numbers: float) -> Tensor:
+        """Log a training step without a synchronisation, and hand it to the guard.
 
         Args:
-            size: batch size.
-            **numbers: values by the rest of their tag."""
-        numbers = {
+            total: its loss, a scalar.
+            terms: unweighted terms of the loss by name.
+            **numbers: further values by the rest of their tag ``train/``.
+
+        Returns:
+            The loss."""
+        self.guard.note(step, total)
+        numbers |= {
             "learning_rate": self.optimizers().param_groups[0]["lr"],
             "budget": self.used_budget,
-            **numbers,
+            "skipped_steps": float(self.guard.skipped),
         }
-        values = {}
+        values = {f"loss/{name}": value.detach() for name, value in terms.items()}
         for name, number in numbers.items():
             # Created on the model's device: copying a number there would be a synchronisation.
             is_there = isinstance(number, torch.Tensor)
             values[f"train/{name}"] = number if is_there else torch.full((), number, device=self.device)
+        size = len(step.batch.images)
+        self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict(values, batch_size=size)
+        return total
+
+    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
+        """Clip the gradients of all weights, which are already unscaled, to a norm of ``optimizer.clip``,
+        and log their norm before. Lightning's arguments are not used.
+
+        Raises:
+            InputError: the step is not finite, and the guard does not skip it."""
+        self.optimization.drop_frozen_gradients(self, self.used_budget)
+        norm = self.optimization.clip_gradients(self)
+        if self.guard.check(self, norm, self._scaler):
+            self.log("train/gradient_norm", norm)
 
     @property
     def _scaler(self) -> torch.amp.GradScaler | None:
@@ -148,10 +169,12 @@ class BudgetedModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check that Muon does not resume from AdamW's state, or vice versa.
+        """Restore the number of skipped steps, and check that Muon does not resume from AdamW's state, or
+        vice versa.
 
         Raises:
             InputError: they differ; the message names ``optimizer.matrix_scale``."""
+        self.guard.skipped = checkpoint.get("skipped_steps", 0)
         scale = getattr(self.optimization, "matrix_scale", None)  # a plug-in may lack this option
         for state in checkpoint.get("optimizer_states", ()):
             by_muon = any("orthogonal" in group for group in state["param_groups"])
@@ -159,9 +182,11 @@ class BudgetedModule(L.LightningModule):
             require(by_muon == (scale is not None), "optimizer.matrix_scale", expected, scale)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the format's version, the configuration and the names of frozen weights to a checkpoint:
-        only plain data, so that it loads with ``torch.load(weights_only=True)``."""
+        """Add the format's version, the configuration, the names of frozen weights and the number of
+        skipped steps to a checkpoint: only plain data, so that it loads with
+        ``torch.load(weights_only=True)``."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = self.config
+        checkpoint["skipped_steps"] = self.guard.skipped
         checkpoint["frozen"] = [name for name, p in self.named_parameters() if not p.requires_grad]
         convert_rates_to_numbers(checkpoint)

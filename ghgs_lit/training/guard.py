@@ -1,5 +1,5 @@
 """Guard against training steps with values that are not finite: finds the stage, saves the batch, and
-skips the step."""
+skips the step or stops the run."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -19,16 +19,8 @@ from ghgs_lit.training.optimization import named_weights
 from ghgs_lit.types import Batch, map_tensors
 
 #: Dotted paths of the stages to which faults are attributed.
-_STAGES = {name: f"model.{name}" for name in (*STAGES, "rounds")} | {
-    "renderer": "renderer",
-    "losses": "losses",
-}
-#: Maximum number of batches that a run saves.
-_SAVED = 10
-
-
-class DivergedError(InputError):
-    """A loss or a gradient is not finite."""
+_STAGES = {name: f"model.{name}" for name in (*STAGES, "rounds")}
+_STAGES |= {"renderer": "renderer", "losses": "losses"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +76,7 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
     and gradients. Weights and their gradients are not changed.
 
     Args:
-        module: module with ``model``, ``renderer``, ``losses`` and ``forward_losses``, such as
+        module: module whose ``forward_losses`` returns the loss of a step first, such as
             :class:`~ghgs_lit.training.module.GHGSModule`.
         scale: factor of the loss (``16-mixed``).
 
@@ -100,8 +92,9 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
     precision = module.trainer.precision_plugin
     try:
         with torch.enable_grad(), watch_stages(module, _STAGES, fault), precision.train_step_context():
-            total = module.forward_losses(step)[1]
-            slopes = torch.autograd.grad(total * scale, list(trained.values()), allow_unused=True)
+            slopes = torch.autograd.grad(
+                module.forward_losses(step)[0] * scale, list(trained.values()), allow_unused=True
+            )
     except Exception:  # a stage may reject values that are not finite
         if not fault.text:
             raise
@@ -113,8 +106,8 @@ def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> st
 
 class Guard:
     """Checks that the loss and the gradient of each step are finite. A step that is not is repeated to
-    find the fault, its inputs are saved to ``<run>/faults/step_<n>.pt``, and it is skipped. All
-    processes make the same decision.
+    find the fault, its inputs are saved to ``<run>/faults/step_of_process_<rank>.pt``, and it is skipped.
+    All processes make the same decision.
 
     Args:
         limit: maximum number of consecutive steps that are skipped before the run stops.
@@ -129,47 +122,43 @@ class Guard:
         self._steps: list[tuple[Step, Tensor]] = []
 
     def note(self, step: Step, loss: Tensor) -> None:
-        """Store a forward pass of the optimizer's next step, without a synchronisation.
-
-        Args:
-            step: inputs of the forward pass.
-            loss: its total loss, a scalar."""
+        """Store a forward pass of the optimizer's next step and its loss, without a synchronisation."""
         self._steps.append((step, loss.detach()))
 
-    def is_finite(self, trainer: L.Trainer, norm: Tensor) -> tuple[bool, bool]:
-        """Check the next step of the optimizer. This is a training step's only device-to-host
-        synchronisation.
+    def check(self, module: L.LightningModule, norm: Tensor, scaler: torch.amp.GradScaler | None) -> bool:
+        """Check the next step of the optimizer; a training step's only device-to-host synchronisation.
+
+        A gradient that overflows with a factor above 1 is left to the gradient scaler, which skips the
+        step and halves the factor.
 
         Args:
+            module: see :func:`first_fault`; the gradients of a step to be skipped are removed.
             norm: norm of the gradient, a scalar.
+            scaler: scaler of the loss (``16-mixed``), if any.
 
         Returns:
-            Whether all losses since the last step are finite in all processes, and whether the norm
-            is."""
-        losses = torch.stack([loss for _, loss in self._steps]) if self._steps else norm.new_zeros(1)
-        flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
-        if trainer.world_size > 1:
-            flags = trainer.strategy.reduce(flags, reduce_op="min")
-        losses_hold, norm_holds = flags.tolist()
-        return bool(losses_hold), bool(norm_holds)
-
-    def accept(self) -> None:
-        """Accept the step: it is finite, or the gradient scaler skips it."""
-        self._steps.clear()
-        self._in_a_row = 0
-
-    def skip(self, module: L.LightningModule, scale: float) -> None:
-        """Find and save the fault, and remove the gradients, so that the optimizer changes nothing.
-
-        Args:
-            module: see :func:`first_fault`.
-            scale: factor of the loss.
+            Whether all losses since the last step, and the norm, are finite in all processes.
 
         Raises:
-            DivergedError: more than ``limit`` consecutive steps were not finite."""
+            InputError: more than ``limit`` consecutive steps were not finite."""
+        losses = torch.stack([loss for _, loss in self._steps])
+        flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
+        if module.trainer.world_size > 1:
+            flags = module.trainer.strategy.reduce(flags, reduce_op="min")
+        loss_holds, norm_holds = flags.tolist()
+        is_finite = bool(loss_holds and norm_holds)
+        scale = 1.0 if is_finite or scaler is None else scaler.get_scale()
+        if is_finite or (loss_holds and scale > 1):
+            self._in_a_row = 0
+        else:
+            self._skip(module, scale)
+        self._steps.clear()
+        return is_finite
+
+    def _skip(self, module: L.LightningModule, scale: float) -> None:
+        """Find and save the fault, and remove the gradients, so that the optimizer changes nothing."""
         trainer = module.trainer
         faults = [self._explain(module, scale)]
-        self._steps.clear()
         if trainer.world_size > 1:
             (mine,) = faults
             faults = [""] * trainer.world_size
@@ -177,7 +166,7 @@ class Guard:
         found = "; ".join(filter(None, faults)) or "values that are finite one by one, or when run again"
         message = f"step {module.global_step}: expected a finite loss and gradient; found {found}"
         if self._in_a_row >= self.limit:
-            raise DivergedError(message)
+            raise InputError(message)
         self._in_a_row += 1
         self.skipped += 1
         module.zero_grad()
@@ -187,14 +176,9 @@ class Guard:
     def _explain(self, module: L.LightningModule, scale: float) -> str:
         """Describe the first fault of this process, and name the file with its batch; "": no fault."""
         for step, _ in self._steps:
-            if not (fault := first_fault(module, step, scale)):
-                continue
-            folder = Path(module.trainer.default_root_dir) / "faults"
-            if len(list(folder.glob("*.pt"))) >= _SAVED:
-                return fault
-            rank = f"_process_{module.global_rank}" if module.global_rank else ""
-            path = folder / f"step_{module.global_step:06d}{rank}.pt"
-            content = dataclasses.asdict(step) | {"fault": fault}
-            write_atomically(path, partial(torch.save, content))
-            return f"{fault}; its batch is in {path}"
+            if fault := first_fault(module, step, scale):
+                folder = Path(module.trainer.default_root_dir) / "faults"
+                path = folder / f"step_of_process_{module.global_rank}.pt"
+                write_atomically(path, partial(torch.save, dataclasses.asdict(step) | {"fault": fault}))
+                return f"{fault}; its batch is in {path}"
         return ""

@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.config import build
@@ -20,9 +19,9 @@ from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan.presets import KeptTokens, keep_patches
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.guard import Guard, Step
+from ghgs_lit.training.guard import Step
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering, Targets
+from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
 Choice = TypeVar("Choice")
@@ -99,7 +98,6 @@ class GHGSModule(BudgetedModule):
         self.renderer = renderer
         self.losses = losses
         self.token_budgets = token_budgets
-        self.guard = Guard(optimization.skip_nonfinite)
         self.metrics = MetricsOptions(lpips="off").build()
         self.means = nn.ModuleDict({name: image_mean() for name in VALIDATED})
         #: Prepares batches for the model; None: the model is not a :class:`GHGS` and takes them directly.
@@ -139,21 +137,12 @@ class GHGSModule(BudgetedModule):
         prediction = (self.predictor or self.model)(batch)
         return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
-    def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
-        """Run the forward pass of a step, with random numbers from its seed.
-
-        Returns:
-            The prediction, the scalar loss, and the unweighted terms of the loss by name."""
+    def forward_losses(self, step: Step) -> Outcome:
+        """Run the forward pass of a step eagerly, with random numbers from its seed."""
         torch.manual_seed(step.seed)
         with token_budget(self.model, step.budget):
             prediction, rendering = self(step.batch)
-        total, values = self.losses(prediction, rendering, step.batch)
-        return prediction, total, values
-
-    def _run_eagerly(self, step: Step) -> Outcome:
-        """Run the forward pass of a step eagerly."""
-        prediction, total, values = self.forward_losses(step)
-        return Outcome(total, values, len(prediction.gaussians))
+        return Outcome(*self.losses(prediction, rendering, step.batch), len(prediction.gaussians))
 
     def _run_captured(self, step: Step) -> Outcome | None:
         """Run the forward pass of a step with CUDA-graph capture; None: it must run eagerly."""
@@ -166,29 +155,19 @@ class GHGSModule(BudgetedModule):
         with token_budget(self.model, step.budget):
             return captured(step.batch, scale)
 
-    def _make_step(self, batch: Batch, batch_idx: int) -> Step:
-        """Assemble all inputs of a training step."""
-        budget = None
-        # Equal in all processes, so that none waits for another.
-        if self.token_budgets is not None:
-            budget = sample_budget(self.token_budgets, self.step_numbers(batch_idx))
-        return Step(batch, self.step_seed(batch_idx), budget)
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Run the forward pass of a step on a batch with targets and log its loss, without a
         synchronisation.
 
         Returns:
             The total loss, a scalar."""
-        step = self._make_step(batch, batch_idx)
-        total, values, gaussians = self._run_captured(step) or self._run_eagerly(step)
-        self.guard.note(step, total)
-        size = len(batch.images)
-        self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
-        self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
-        skipped = float(self.guard.skipped)
-        self.log_numbers(size, skipped_steps=skipped, gaussians=gaussians / size)
-        return total
+        budget = None
+        if self.token_budgets is not None:
+            # Equal in all processes, so that none waits for another.
+            budget = sample_budget(self.token_budgets, self.step_numbers(batch_idx))
+        step = Step(batch, self.step_seed(batch_idx), budget)
+        total, terms, gaussians = self._run_captured(step) or self.forward_losses(step)
+        return self.log_step(step, total, terms, gaussians=gaussians / len(batch.images))
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Predict, render and measure a batch with targets.
@@ -197,7 +176,11 @@ class GHGSModule(BudgetedModule):
             ``prediction`` and ``rendering``, for callbacks."""
         prediction, rendering = self(batch)
         size = len(batch.images)
-        for name, values in self._measure(rendering.image, batch.targets, VALIDATED).items():
+        targets = batch.targets
+        known = [name for name in VALIDATED if name != "lpips" or self.metrics.lpips is not None]
+        flat = (values.flatten(0, 1) for values in (rendering.image, targets.images, targets.masks))
+        depths = None if targets.depths is None else targets.depths.flatten(0, 1)
+        for name, values in self.metrics.measure(*flat, known, depths).items():
             self.means[name].update(values)
             is_first = name == VALIDATED[0]
             self.log(f"val/{name}", self.means[name], prog_bar=is_first, on_epoch=True, batch_size=size)
@@ -209,46 +192,14 @@ class GHGSModule(BudgetedModule):
             self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
 
-    def _measure(
-        self, image: Float[Tensor, "b t 3 h w"], targets: Targets, names: Sequence[str]
-    ) -> dict[str, Tensor]:
-        """Metrics of each target view, [b * t], by name; without LPIPS where it is not available."""
-        known = [name for name in names if name != "lpips" or self.metrics.lpips is not None]
-        flat = (values.flatten(0, 1) for values in (image, targets.images, targets.masks))
-        depths = None if targets.depths is None else targets.depths.flatten(0, 1)
-        return self.metrics.measure(*flat, known, depths)
-
-    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip the gradients of all weights to a norm of ``optimizer.clip``, and log their norm before.
-
-        Gradients are already unscaled, and Lightning's arguments are not used. After an overflow, the
-        gradient scaler skips the step and halves its factor. The guard handles losses that are not
-        finite, and gradients that overflow with a factor of at most 1.
-
-        Raises:
-            DivergedError: the step is not finite, and the guard does not skip it."""
-        self.optimization.drop_frozen_gradients(self, self.used_budget)
-        norm = self.optimization.clip_gradients(self)
-        loss_holds, norm_holds = self.guard.is_finite(self.trainer, norm)
-        if loss_holds and norm_holds:
-            self.log("train/gradient_norm", norm)
-        else:
-            scale = 1.0 if self._scaler is None else self._scaler.get_scale()
-            if not loss_holds or scale <= 1:
-                self.guard.skip(self, scale)
-                return
-        self.guard.accept()
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the number of skipped steps and the shape buckets of captured steps."""
+        """Add the shape buckets of captured steps."""
         super().on_save_checkpoint(checkpoint)
-        checkpoint["skipped_steps"] = self.guard.skipped
         if self.captured_step is not None:
             checkpoint["shape_buckets"] = self.captured_step.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the number of skipped steps and the shape buckets."""
+        """Restore the shape buckets of captured steps."""
         super().on_load_checkpoint(checkpoint)
-        self.guard.skipped = checkpoint.get("skipped_steps", 0)
         if self.captured_step is not None:
             self.captured_step.load_state_dict(checkpoint.get("shape_buckets", ()))

@@ -21,7 +21,7 @@ from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.method.encoder.semantic import SemanticBranch, features_of
 from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.training.base import BudgetedModule
-from ghgs_lit.training.guard import DivergedError
+from ghgs_lit.training.guard import Step
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 
@@ -164,13 +164,15 @@ class PretextModule(BudgetedModule):
         super().__init__(model, optimization, config)
         self.part_accuracy = MeanMetric()
 
+    def forward_losses(self, step: Step) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the loss of a step, also by its name."""
+        loss = cross_entropy(*self.model(step.batch)[:2])
+        return loss, {"parts": loss}
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Compute, log and return the loss."""
-        loss = cross_entropy(*self.model(batch)[:2])
-        size = len(batch.images)
-        self.log("loss/parts", loss.detach(), prog_bar=True, batch_size=size)
-        self.log_numbers(size)
-        return loss
+        step = Step(batch, self.step_seed(batch_idx))
+        return self.log_step(step, *self.forward_losses(step))
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Measure the accuracy of nearest patches per person, and the loss."""
@@ -186,16 +188,3 @@ class PretextModule(BudgetedModule):
         size = len(batch.images)
         self.log("val/part_accuracy", self.part_accuracy, prog_bar=True, on_epoch=True, batch_size=size)
         self.log("val/parts", cross_entropy(log_shares, shares), on_epoch=True, batch_size=size)
-
-    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip the gradients to a norm of ``optimizer.clip``, and log their norm before. Lightning's
-        arguments are not used.
-
-        Raises:
-            DivergedError: the norm is not finite."""
-        norm = self.optimization.clip_gradients(self)
-        if not norm.isfinite():
-            raise DivergedError(
-                f"step {self.global_step}: expected a finite gradient; found a norm of {norm}"
-            )
-        self.log("train/gradient_norm", norm)
