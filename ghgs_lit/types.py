@@ -375,12 +375,6 @@ class Gaussians(TensorStruct):
         changes = {name: values[index] for name, values in self._rows().items()}
         return dataclasses.replace(self, **changes, splits=splits)
 
-    def with_more(self, others: "Gaussians") -> "Gaussians":
-        """These Gaussians followed by others; both of one element, with the same optional fields."""
-        more = others._rows()
-        both = {name: torch.cat((values, more[name])) for name, values in self._rows().items()}
-        return dataclasses.replace(self, **both, splits=(len(self) + len(others),))
-
     def __getitem__(self, element: int) -> "Gaussians":
         """The Gaussians of one batch element.
 

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -49,8 +48,6 @@ class DiskFeatureCache(Options):
 
     folder: PathText | None = None
     """Folder of the cache; null: the folder features in $GHGS_CACHE, or in ~/.cache/ghgs_lit."""
-    dtype: Literal["float16", "bfloat16"] = "float16"
-    """Type in which tokens are stored and used: float16 has 11 significant bits, bfloat16 has 8."""
 
     def needs(self, model: nn.Module, data: PhotographsDataModule, network: str = "*") -> str:
         """Describe how much a training will write, and check that the disk has room for it.
@@ -77,7 +74,7 @@ class DiskFeatureCache(Options):
         count = sum(map(len, data.subjects("train").values()))
         patches = math.prod(-(-side // vit.patch_size) for side in data.dataset.size)  # rounded up: padding
         size = count * patches * 2 * vit.pos_embed.shape[-1]
-        files = self._root.glob(f"{network}-*-{self.dtype}/*/*.npy")
+        files = self._root.glob(f"{network}-*-float16/*/*.npy")
         there = sum(path.stat().st_size for path in files)
         key = f"feature_cache.folder: {self._root}"
         free = shutil.disk_usage(require_writable(self._root.absolute(), key, "tokens")).free
@@ -106,25 +103,23 @@ class DiskFeatureCache(Options):
             heads = vit.blocks[0].attn.heads
             network = digest_of({**vit.state_dict(), f"heads {heads}": torch.zeros(0)})[:16]
             text = self.needs(model, data, network)
-            vit.cache = FeatureCache(self._root, network, getattr(torch, self.dtype))
+            vit.cache = FeatureCache(self._root, network)
         if rank_zero_only.rank == 0:
             log.info(text)
 
 
 class FeatureCache:
-    """Cache of patch tokens, with the content of an image as key.
+    """Cache of patch tokens in float16, with the content of an image as key. Newly computed tokens are
+    rounded to it, too, so that results do not depend on which tokens were cached.
 
     Args:
         folder: folder of the caches of all networks.
         network: name of the network, a digest of all its weights.
-        dtype: float16 or bfloat16, in which tokens are stored. Newly computed tokens are rounded to it,
-            too, so that results do not depend on which tokens were cached.
     """
 
-    def __init__(self, folder: Path, network: str, dtype: torch.dtype) -> None:
+    def __init__(self, folder: Path, network: str) -> None:
         self.folder = folder
         self.network = network
-        self.dtype = dtype
         #: Number of images whose tokens were read, and of those whose tokens were computed.
         self.read = self.computed = 0
 
@@ -142,24 +137,25 @@ class FeatureCache:
             Tokens [n, p, c] with the images' dtype and device.
 
         Raises:
-            InputError: a token overflows ``dtype``.
+            InputError: a token overflows float16.
             OSError: the disk is full.
         """
         paths = [self._path(image, images.device) for image in images.detach().cpu()]
         stored = [_map_file(path) for path in paths]
         lacking = [number for number, tokens in enumerate(stored) if tokens is None]
         if lacking:
-            new = compute(images[lacking]).to(self.dtype)
-            expected = f"tokens that {str(self.dtype).removeprefix('torch.')} can hold"
-            require(bool(new.isfinite().all()), "feature_cache.dtype", expected, "larger ones")
+            new = compute(images[lacking]).half()
+            is_finite = bool(new.isfinite().all())
+            require(is_finite, "feature_cache", "none where tokens are too large for float16", "disk")
             for number, tokens in zip(lacking, new.cpu(), strict=True):
-                stored[number] = tokens.view(torch.int16).numpy()  # NumPy has no bfloat16
+                stored[number] = tokens.numpy()
                 write_atomically(paths[number], partial(_write, stored[number]))
         self.computed += len(lacking)
         self.read += len(paths) - len(lacking)
-        result = torch.empty(len(stored), *stored[0].shape, dtype=torch.int16, pin_memory=images.is_cuda)
-        np.stack(stored, out=result.numpy())
-        return result.view(self.dtype).to(images.device, non_blocking=True).to(images.dtype)
+        result = torch.empty(len(stored), *stored[0].shape, dtype=torch.float16, pin_memory=images.is_cuda)
+        # Files of earlier versions hold the same bytes as int16.
+        np.stack([tokens.view(np.float16) for tokens in stored], out=result.numpy())
+        return result.to(images.device, non_blocking=True).to(images.dtype)
 
     def place(self, device: torch.device) -> Path:
         """Folder of this network and of the present precision of matrix products.
@@ -171,7 +167,7 @@ class FeatureCache:
         rounding = "tf32" if rounds_products(kind) else "float32"
         if torch.is_autocast_enabled(kind):
             rounding = str(torch.get_autocast_dtype(kind)).removeprefix("torch.")
-        return self.folder / f"{self.network}-{rounding}-{str(self.dtype).removeprefix('torch.')}"
+        return self.folder / f"{self.network}-{rounding}-float16"
 
     def _path(self, image: Tensor, device: torch.device) -> Path:
         """File of an image on the CPU, named by its dtype, shape and content."""
@@ -182,7 +178,7 @@ class FeatureCache:
 
 
 def _map_file(path: Path) -> np.ndarray | None:
-    """Tokens [p, c] of a file, memory-mapped as int16; None if it is missing or damaged."""
+    """Tokens [p, c] of a file, memory-mapped; None if it is missing or damaged."""
     try:
         return np.load(path, mmap_mode="r")
     except (FileNotFoundError, ValueError, EOFError):

@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 import lightning.pytorch as L
-from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
+from lightning.pytorch.profilers import SimpleProfiler
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
@@ -24,10 +24,6 @@ Precision = Annotated[
     Literal["32-true", "tf32", "bf16-mixed", "16-mixed", "32", "bf16", "16", 32, 16],
     Words("32-true, tf32, bf16-mixed or 16-mixed"),
 ]
-#: Batches of an epoch, as a number or as a share in (0, 1].
-Batches = Count | Annotated[float, Field(gt=0, le=1)]
-
-_PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
 
 class TrainerOptions(Options):
@@ -41,11 +37,6 @@ class TrainerOptions(Options):
     which each holds all parameters. At most 64, as on a CPU all start at once."""
     num_nodes: int = Field(1, ge=1, le=1024)
     """Number of machines, each with the processes of devices; SLURM or torchrun starts them."""
-    strategy: Literal[
-        "auto", "ddp", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_false"
-    ] = "auto"
-    """Strategy for several processes; auto: DDP that allows parameters without a gradient, which
-    ablations have."""
     precision: Precision = "32-true"
     """32-true (the paper's, also for convolutions), tf32, bf16-mixed or 16-mixed; geometry is always
     float32."""
@@ -64,13 +55,7 @@ class TrainerOptions(Options):
     """Batches whose gradients each step accumulates."""
     deterministic: bool | Literal["warn"] = False
     """true: use deterministic operations only, and raise where PyTorch has none; warn: warn there."""
-    limit_train_batches: Batches | None = None
-    """Training batches of an epoch, or their share; null: all."""
-    overfit_batches: Index | Share = 0.0
-    """Train repeatedly on this number of first batches, or on this share; 0: on all."""
-    fast_dev_run: bool | Count = False
-    """Smoke test: true (one) or a number of steps, then a validation of as many batches, without logs."""
-    profiler: Literal["simple", "advanced", "pytorch"] | None = None
+    profiler: Literal["simple"] | None = None
     """Lightning's profiler, which writes the times of hooks to <run>/fit-profile.txt."""
 
     def build(self, **arguments: Any) -> L.Trainer:
@@ -89,13 +74,11 @@ class TrainerOptions(Options):
         if self.accelerator == "cpu" and isinstance(self.devices, tuple):
             options["devices"] = len(self.devices)
         alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
-        if self.strategy == "auto" and not (alone and self.num_nodes == 1):
+        if not (alone and self.num_nodes == 1):
             # Not every parameter has a gradient in every step (ablations, skipped work).
             options["strategy"] = "ddp_find_unused_parameters_true"
-        if self.profiler is not None:
-            # Written to files, as Lightning's log lines are silenced.
-            folder = arguments.get("default_root_dir")
-            options["profiler"] = _PROFILERS[self.profiler](dirpath=folder, filename="profile")
+        if self.profiler is not None:  # written to a file, as Lightning's log lines are silenced
+            options["profiler"] = SimpleProfiler(arguments.get("default_root_dir"), "profile")
         try:
             return L.Trainer(
                 **options,

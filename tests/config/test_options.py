@@ -92,14 +92,14 @@ def test_yaml_and_options_of_a_verb_agree(verb):
 UNLIMITED = {
     "there are no more": """
         subjects subject limit.train limit.val pictures k tolerance chamfer_points limit_val_batches
-        limit_train_batches overfit_batches start stop step split frames cameras""",
+        start stop step split frames cameras""",
     "refused where there are fewer": """
         evaluation_positions positions views evaluation_count training_counts per_subject per_step layers
         token sequences""",
     "how seldom something comes": """
         every every_n_train_steps log_every_n_steps val_check_interval exact_from""",
     "the end of a run or epoch comes first, or Ctrl-C": """
-        max_steps fast_dev_run steps_per_epoch accumulate_grad_batches skip_nonfinite""",
+        max_steps steps_per_epoch accumulate_grad_batches skip_nonfinite""",
     "of a list": "devices",
 }
 
