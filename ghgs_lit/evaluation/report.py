@@ -22,11 +22,6 @@ PRINTED = {"psnr": 2, "psnr_box": 2, "psnr_edge": 2, "ssim": 4, "lpips": 4, "fli
 PRINTED |= {"spill": 1, "sharpness": 2, "depth_error_mm": 1, "seconds": 2}
 #: Units in the column heads of printed metrics whose names have none.
 _UNITS = dict.fromkeys(("psnr", "psnr_box", "psnr_edge"), "\ndB") | {"spill": "\n‰"}
-#: Descriptions of splits for readers of the results.
-SPLITS = {
-    "train": "the subjects that were trained on",
-    "val": "unseen in training; validation shares them: it chooses best.ckpt, and never last.ckpt",
-}
 
 
 def measure_and_write(
@@ -79,8 +74,6 @@ def measure_and_write(
             "target_protocols": targets,
             "reported": metrics.names,
             "left_out": metrics.left_out,
-            "definitions": metrics.definitions,
-            "split": SPLITS.get(split, "unseen in training"),
         },
         **facts,
     )

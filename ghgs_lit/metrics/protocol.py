@@ -11,10 +11,6 @@ from torch import Tensor
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import InputError, import_optional
 from ghgs_lit.metrics.functional import (
-    BESIDE,
-    BRIGHTNESS,
-    INNER,
-    PSNR_CAP,
     decibels,
     flip_map,
     psnr_box_40,
@@ -23,31 +19,13 @@ from ghgs_lit.metrics.functional import (
     squared_error,
     ssim_map,
 )
-from ghgs_lit.metrics.regions import DEPTH_STEP, EDGE, mean_over, region_of
-
-NETWORK = "vgg"
+from ghgs_lit.metrics.regions import mean_over, region_of
 
 _ALL = ("psnr", "ssim", "flip")
 #: Metrics of each region; SSIM and FLIP use windows, which thin regions do not fill.
 MEASURED = {"image": _ALL, "box": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
 #: Further metrics, and the region that enables each.
 FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
-
-
-#: Definitions of each region and of the metrics that it enables.
-_REGIONS = {
-    "box": {
-        "box": "the smallest upright box of the subject's mask in the target",
-        "psnr_box_40": f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask",
-    },
-    "subject": {"subject": "the pixels of the subject's mask in the target"},
-    "edge": {
-        "edge": f"pixels at most {EDGE} rows and columns from the outline of the subject's mask, and from "
-        f"steps of more than {DEPTH_STEP:.0%} of the true depth where known",
-        "spill": f"light farther than {BESIDE} pixels from the mask, per mille of the subject's",
-        "sharpness": f"energy of the Laplacian over the target's, {INNER} pixels inside the mask",
-    },
-}
 
 
 class LPIPS:
@@ -68,10 +46,10 @@ class LPIPS:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self.network = LearnedPerceptualImagePatchSimilarity(net_type=NETWORK).net
+                self.network = LearnedPerceptualImagePatchSimilarity(net_type="vgg").net
         except Exception as error:  # a download can fail in many ways
             reason = " ".join(str(error).split())
-            raise InputError(f"{key}: the weights of {NETWORK!r} could not be loaded: {reason}") from error
+            raise InputError(f"{key}: the weights of 'vgg' could not be loaded: {reason}") from error
         self.signed = signed
 
     def __call__(
@@ -99,12 +77,7 @@ class MetricsOptions(Options):
     """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it
     was calibrated. release: as the authors' code: no clamp, SSIM padded with zeros, LPIPS on [0, 1].
     Reported with every number."""
-    regions: tuple[Literal["image", "box", "subject", "edge"], ...] = (
-        "image",
-        "box",
-        "subject",
-        "edge",
-    )
+    regions: tuple[Literal["image", "box", "subject", "edge"], ...] = ("image", "box", "subject", "edge")
     """Regions in which PSNR, SSIM and FLIP are measured. image: all pixels; box: the mask's bounding
     box (also PSNR at a common brightness); subject: the mask's pixels (without FLIP); edge: the mask's
     outline and edges of true depth (PSNR alone; also light outside the subject and sharpness inside)."""
@@ -119,11 +92,6 @@ class MetricsOptions(Options):
     def is_release(self) -> bool:
         """Whether metrics are computed as in the authors' code."""
         return self.protocol == "release"
-
-    @property
-    def ssim_padding(self) -> str:
-        """Padding of SSIM (:func:`ssim_map`)."""
-        return "zeros" if self.is_release else "reflect"
 
     def build(self) -> "ImageMetrics":
         """Build the metrics; raises InputError as :class:`ImageMetrics` does."""
@@ -187,32 +155,6 @@ class ImageMetrics:
         if self.lpips is not None:
             names.append("lpips")
         return names
-
-    @property
-    def definitions(self) -> dict[str, str]:
-        """Definition of each metric and region, to be stored with the numbers."""
-        options = self.options
-        renders = "as they are" if options.is_release else "clamped to [0, 1]"
-        text = {
-            "image": f"renders {renders}, RGB, data range 1",
-            "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
-            "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
-            "shared_neighbors": "share of neighbours that the other recalibration.neighborhood has, too",
-            "surface_mm": "mean distance of Gaussians (by opacity) to the surface of the inputs, and back",
-        }
-        measured = set().union(*(MEASURED[region] for region in options.regions))
-        if "ssim" in measured:
-            text["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
-        if "flip" in measured:
-            text["flip"] = "FLIP at 67.02 pixels a degree"
-        for region in _REGIONS:
-            if region in options.regions:
-                text |= _REGIONS[region]
-        if self.lpips is not None:
-            text["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
-        if self.beside is not None:
-            text |= self._beside(self.beside.definitions)
-        return text
 
     def __call__(
         self,
@@ -280,5 +222,5 @@ class ImageMetrics:
         if metric == "psnr":
             return squared_error(image, target)
         if metric == "ssim":
-            return ssim_map(image, target, self.options.ssim_padding).mean(1)
+            return ssim_map(image, target, "zeros" if self.options.is_release else "reflect").mean(1)
         return flip_map(image, target)
