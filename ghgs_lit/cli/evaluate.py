@@ -72,20 +72,6 @@ def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.devi
     return {name: baseline(name, renderer, untrained, run.per_scene.steps) for name in names}
 
 
-def _methods(run: "Evaluate", device: torch.device) -> tuple[dict[str, Method], dict[str, Any]]:
-    """Methods to evaluate by name, and facts about the model."""
-    path = run.checkpoint
-    if path is None and not run.baselines:
-        raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
-    methods: dict[str, Method] = {}
-    facts: dict[str, Any] = {"checkpoint": path}
-    if path is not None:
-        methods["model"], model_facts = trained_method(run, device)
-        facts |= model_facts
-    methods |= baselines_of(run.baselines, run, device)
-    return methods, facts
-
-
 def run(verb: "Evaluate") -> None:
     """Evaluate a checkpoint, baselines or both, and write the results.
 
@@ -99,12 +85,17 @@ def run(verb: "Evaluate") -> None:
     write_config(verb, directory)
     L.seed_everything(verb.seed, workers=True, verbose=False)
     device = inputs.pick_device(verb.device)
-    methods, facts = _methods(verb, device)
+    if verb.checkpoint is None and not verb.baselines:
+        raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
+    methods: dict[str, Method] = {}
+    facts = {"verb": "evaluate", "choices": inputs.choices(), "checkpoint": verb.checkpoint}
+    if verb.checkpoint is not None:
+        methods["model"], model_facts = trained_method(verb, device)
+        facts |= model_facts
+    methods |= baselines_of(verb.baselines, verb, device)
     data = inputs.build_data(verb)
     for method in methods.values():
         if isinstance(method, ModelMethod):
             inputs.check_size(data, method.predict)
     check_evaluation(verb, data)
-    facts |= {"verb": "evaluate", "choices": inputs.choices()}
-    path = measure_and_write(methods, data, verb, directory, device, **facts)
-    announce(path)
+    announce(measure_and_write(methods, data, verb, directory, device, **facts))

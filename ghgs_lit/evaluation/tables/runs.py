@@ -188,7 +188,7 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     planned = []
     for path, config in begun.items():
         counts = views.get(path, lookup(config, "evaluation.views"))
-        counts = (counts,) if isinstance(counts, int) else tuple(counts)
+        counts = (counts,) if isinstance(counts, int) else tuple(counts or ())
         data = str(lookup(config, "data.name"))
         planned.append(Planned(variants[path], data, counts, config.get("seed", 0)))
     return Sweep(pd.concat(frames, ignore_index=True), planned, models)
