@@ -1,5 +1,6 @@
 """Pictures [h, w, 3] RGB uint8 of input images, renders, errors and depths."""
 
+import textwrap
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from ghgs_lit.types import Batch
 _LETTERS = 22  # Width of the narrowest tile divided by the height of letters
 _LEAST_LETTERS = 10  # Least height of letters in pixels
 _GAP = 2
+_GREY = (24, 24, 24)
 ERROR_GAIN = 4.0  #: Factor of errors in pictures
 
 
@@ -62,18 +64,6 @@ def error_map(image: Tensor, target: Tensor) -> np.ndarray:
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
-def _caption_lines(caption: str, width: int, font: ImageFont.FreeTypeFont) -> list[str]:
-    """Wrap a caption at spaces to the width of its tile; longer words are not broken."""
-    lines = []
-    for word in caption.split():
-        longer = f"{lines[-1]} {word}" if lines else word
-        if lines and font.getlength(longer) <= width:
-            lines[-1] = longer
-        else:
-            lines.append(word)
-    return lines
-
-
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
     """Concatenate tiles horizontally, each below its caption.
 
@@ -86,21 +76,19 @@ def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
     """
     letters = max(_LEAST_LETTERS, min(tile.shape[1] for tile in tiles) // _LETTERS)
     font = ImageFont.load_default(letters)
-    texts = [
-        _caption_lines(caption, tile.shape[1] - 2 * _GAP, font)
-        for tile, caption in zip(tiles, captions, strict=True)
-    ]
-    line_height = letters + 4
-    above = line_height * max(len(lines) for lines in texts)
+    texts = []
+    for tile, caption in zip(tiles, captions, strict=True):
+        columns = max(1, int((tile.shape[1] - 2 * _GAP) / font.getlength("n")))
+        texts.append(textwrap.wrap(caption, columns, break_long_words=False))
+    above = (letters + 4) * max(1, *map(len, texts))
     height = max(tile.shape[0] for tile in tiles) + above
     width = sum(tile.shape[1] for tile in tiles) + _GAP * (len(tiles) - 1)
-    canvas = Image.new("RGB", (width, height), (24, 24, 24))
+    canvas = Image.new("RGB", (width, height), _GREY)
     left = 0
     for tile, lines in zip(tiles, texts, strict=True):
-        strip = Image.new("RGB", (tile.shape[1], above), (24, 24, 24))
-        draw = ImageDraw.Draw(strip)
-        for number, line in enumerate(lines):
-            draw.text((_GAP, 1 + number * line_height), line, fill=(230, 230, 230), font=font)
+        strip = Image.new("RGB", (tile.shape[1], above), _GREY)
+        text = "\n".join(lines)
+        ImageDraw.Draw(strip).multiline_text((_GAP, 1), text, fill=(230, 230, 230), font=font, spacing=1)
         canvas.paste(strip, (left, 0))
         canvas.paste(Image.fromarray(tile), (left, above))
         left += tile.shape[1] + _GAP
