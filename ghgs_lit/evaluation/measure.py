@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
-from ghgs_lit.method.recalibration.inspection import Call, collect_calls, neighborhoods
+from ghgs_lit.method.recalibration.inspection import Call, collect_calls, shared_neighbors
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
@@ -131,7 +131,7 @@ def _make_rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[
     flat = metrics(*pictures, depths)
     values = {name: value.reshape(b, t).tolist() for name, value in flat.items()}
     surfaces = [] if estimate.gaussians is None else _surface_errors(batch, estimate.gaussians)
-    around = [] if estimate.recalibrated is None else neighborhoods(*estimate.recalibrated)
+    shares = [] if estimate.recalibrated is None else shared_neighbors(*estimate.recalibrated)
     rows = []
     for element in range(b):
         about = {"subject": batch.subjects[element], "views": batch.images.shape[1]}
@@ -142,10 +142,8 @@ def _make_rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[
             shared["gaussians"] = estimate.gaussians.splits[element]
         if estimate.not_finite is not None and estimate.not_finite[element]:
             shared["not_finite"] = estimate.not_finite[element]
-        if around:
-            shared["tokens"] = around[element].tokens
-            shared["neighbors"] = around[element].neighbors
-            shared["shared_neighbors"] = around[element].shared
+        if shares:
+            shared["shared_neighbors"] = shares[element]
         names = targets.names[element] if targets.names else [str(k) for k in range(t)]
         for k in range(t):
             about |= {"targets": targets.protocols[k], "target": names[k]}

@@ -3,7 +3,6 @@
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -12,26 +11,12 @@ from ghgs_lit.method.recalibration.recalibration import Recalibration
 from ghgs_lit.types import Points, Tokens
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Neighbourhoods of an element's tokens.
-
-    Attributes:
-        tokens: number of recalibrated tokens.
-        neighbors: number of neighbours of each, including itself.
-        shared: fraction of the neighbours that are the same with the other value of
-            ``recalibration.neighborhood``. With nearly all tokens as neighbours it is close to 1, and
-            the ablation of 3D unprojection hardly changes anything.
-    """
-
-    tokens: int
-    neighbors: int
-    shared: float
-
-
 @torch.no_grad()
-def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[Overlap]:
-    """Compare the neighbourhoods of each element with those of the other ``neighborhood`` setting.
+def shared_neighbors(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[float]:
+    """Share of each element's neighbours that are the same with the other ``neighborhood`` setting.
+
+    With nearly all tokens as neighbours it is close to 1, and the ablation of 3D unprojection hardly
+    changes anything.
 
     Args:
         recalibration: the stage.
@@ -43,17 +28,16 @@ def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) 
     pair = (recalibration, other)
     takes_part = recalibration.takes_part(points)
     element = tokens.image // tokens.grid[1]
-    results = []
+    shares = []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, changed = (stage.neighborhood_of(tokens, points, chosen).near for stage in pair)
         is_near = near.new_zeros(len(chosen), len(chosen), dtype=torch.bool).scatter_(1, near, True)
-        shared = is_near.gather(1, changed).float().mean().item() if len(chosen) else 1.0
-        results.append(Overlap(len(chosen), near.shape[1], shared))
-    return results
+        shares.append(is_near.gather(1, changed).float().mean().item() if len(chosen) else 1.0)
+    return shares
 
 
-#: Arguments of :func:`neighborhoods`: a stage and its inputs.
+#: Arguments of :func:`shared_neighbors`: a stage and its inputs.
 Call = tuple[Recalibration, Tokens, Points]
 
 
