@@ -10,8 +10,10 @@ from importlib import import_module
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.library import Library
+
+from ghgs_lit.ops.pool import have_values
 
 LIBRARY = Library("ghgs_lit", "DEF")
 
@@ -110,7 +112,7 @@ def _kind(tensor: Tensor) -> str:
     kind = tensor.device.type
     if kind in DEVICES:
         return "cuda" if kind != "cuda" or _triton_works() else ""
-    return kind if type(tensor) in (Tensor, nn.Parameter) else ""
+    return kind if have_values(tensor) else ""
 
 
 @cache

@@ -19,7 +19,7 @@ import torch
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
-from torch import Tensor, nn
+from torch import Tensor
 
 from ghgs_lit.ops import memory, simd
 from ghgs_lit.ops.compile import helper, processor_features
@@ -132,19 +132,6 @@ _lane_product = make_product((PANEL, 1), adds=True)
 def room(channels: int) -> int:
     """Number of lines written by a layer with ``channels`` outputs, rounded up to whole tiles."""
     return -(-channels // ROWS) * ROWS
-
-
-def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
-    """Weight and bias of each linear layer, in the order that :func:`pack` expects.
-
-    Args:
-        layers: such as the modules of an ``nn.Sequential``; all but ``nn.Linear`` are skipped.
-    """
-    numbers = []
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            numbers += [layer.weight, layer.bias]
-    return numbers
 
 
 def pack(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Division of work into parts, and a thread pool for kernels that run without the interpreter lock."""
 
 import os
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -62,29 +61,11 @@ def in_parts(function: Callable[[slice], Tensor], count: int, most: int) -> Tens
 # Splats or entries that justify one more thread: about a millisecond of work.
 GRAIN = 8192
 
-_lock = threading.Lock()
-_pool: ThreadPoolExecutor | None = None
-_owner: tuple[int, int] | None = None
 
-
-def _reset_lock() -> None:
-    """Replace the lock, which a forked child may inherit while held by a thread of its parent."""
-    global _lock
-    _lock = threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_reset_lock)
-
-
-def _workers(count: int) -> ThreadPoolExecutor:
-    """The thread pool of this process, created anew after a fork or a change of the number of threads."""
-    global _pool, _owner
-    with _lock:
-        if _owner != (os.getpid(), count):
-            _pool = ThreadPoolExecutor(count, thread_name_prefix="ghgs")
-            _owner = (os.getpid(), count)
-        return _pool
+@cache
+def _workers(process: int, count: int) -> ThreadPoolExecutor:
+    """A pool of ``count`` threads; ``process`` is the calling process: a forked child needs its own."""
+    return ThreadPoolExecutor(count, thread_name_prefix="ghgs")
 
 
 def have_values(*tensors: Tensor) -> bool:
@@ -149,7 +130,8 @@ def run(tasks: list, work: int) -> None:
                 return
             task()
 
-    futures = [_workers(torch.get_num_threads() - 1).submit(drain) for _ in range(helpers)]
+    threads = torch.get_num_threads() - 1
+    futures = [_workers(os.getpid(), threads).submit(drain) for _ in range(helpers)]
     drain()
     for future in futures:
         # A helper that has not started is no longer needed, and waiting for it could block.

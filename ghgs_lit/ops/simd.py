@@ -17,7 +17,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
 from ghgs_lit.ops.compile import helper
 
@@ -339,18 +339,6 @@ def log2(typing_context, x):
         return call(builder, "fmuladd", doubles, result, s, builder.sitofp(exponent, doubles.llvm))
 
     return doubles(doubles), emit
-
-
-def length(values):
-    """Length of a tuple as a compile-time constant; an integer is returned unchanged."""
-
-
-@overload(length)
-def _length(values):
-    if isinstance(values, types.BaseTuple):
-        count = len(values)
-        return lambda values: count
-    return lambda values: values
 
 
 def aligned_floats(count):

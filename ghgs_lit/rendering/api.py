@@ -21,8 +21,6 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 BACKENDS = ("auto", "gsplat", "cpu", "reference")
 _OF_DEVICE = {"cuda": "gsplat", "cpu": "cpu"}
-#: Farthest depth in metres: practically no limit.
-FAR = 1e10
 _MODULES = {
     "gsplat": "ghgs_lit.rendering.gsplat_backend",
     "cpu": "ghgs_lit.ops.rasterization.cpu",
@@ -38,15 +36,14 @@ def render(
     backend: str = "auto",
     background: Background = 0.0,
     near: float = 0.01,
-    far: float = FAR,
     settings: RasterSettings | None = None,
 ) -> Rendering:
     """Render ``B`` sets of Gaussians from cameras [B, T].
 
-    Differentiable in means, quaternions, scales, opacities, colours and background. Any number
-    ``C`` of colour channels, any image size and any number of Gaussians per element, including
-    none. The image is defined by :class:`ghgs_lit.ops.rasterization.settings.RasterSettings`, as in 3D
-    Gaussian Splatting (Kerbl et al., 2023).
+    Differentiable in means, quaternions, scales, opacities, colours and background. Any image size and
+    any number of Gaussians per element, including none. The image is defined by
+    :class:`ghgs_lit.ops.rasterization.settings.RasterSettings`, as in 3D Gaussian Splatting (Kerbl et
+    al., 2023).
 
     Args:
         gaussians: N Gaussians of all elements, ``splits`` of them in each; a zero quaternion is the
@@ -55,14 +52,13 @@ def render(
         backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the
             dtype of the means, slow; also differentiable in the cameras) or ``auto``: gsplat
             on CUDA, else cpu.
-        background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
+        background: one number, one per channel, or a tensor that broadcasts with [B, T, 3, h, w].
         near: metres > 0 (see ``gaussians.metre``); Gaussians whose centre has ``z < near`` are
             culled.
-        far: metres > ``near``; Gaussians whose centre has ``z > far`` are culled.
         settings: constants of the image; None: those that the Gaussians were predicted for.
 
     Returns:
-        Image [B, T, C, h, w], alpha [B, T, 1, h, w] in [0, 1], and expected depth [B, T, 1, h, w]
+        Image [B, T, 3, h, w], alpha [B, T, 1, h, w] in [0, 1], and expected depth [B, T, 1, h, w]
         in the unit of the means, 0 where no Gaussian is visible.
 
     Raises:
@@ -71,7 +67,6 @@ def render(
     """
     settings = settings or made_for(gaussians)
     require(0 < near < math.inf, "near", "a number of metres > 0", near)
-    require(near < far < math.inf, "far", f"more than near = {near}", far)
     _check_inputs(gaussians, cameras)
     backend = resolve_backend(backend, gaussians.means.device)
     module = importlib.import_module(_MODULES[backend])
@@ -79,7 +74,7 @@ def render(
     with exact(gaussians.means.device.type):
         gaussians, cameras = _in_metres(*_around_cameras(_in_one_dtype(gaussians), cameras))
         cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
-        rendering = module.rasterize(gaussians, cameras, settings, float(near), float(far))
+        rendering = module.rasterize(gaussians, cameras, settings, float(near))
         if metre is not None:
             metre = metre.to(rendering.depth)[:, None, None, None, None]
             rendering = dataclasses.replace(rendering, depth=rendering.depth * metre)
@@ -128,7 +123,7 @@ class Renderer(Options):
     """Colour behind the Gaussians: one number or one for each channel."""
     near: Positive = 0.01
     """Near plane in metres: Gaussians whose centre is nearer are not rendered."""
-    alpha_max: float = Field(0.999, gt=0, lt=1)
+    alpha_max: float = Field(0.999, gt=1 / 255, lt=1)
     """Upper limit of a Gaussian's alpha; gsplat applies it to opacities."""
 
     def __call__(
@@ -137,18 +132,17 @@ class Renderer(Options):
         """:func:`render` with these options; ``background``, if given, overrides the configured one."""
         background = self.background if background is None else background
         settings = made_for(gaussians, alpha_max=self.alpha_max)
-        return render(gaussians, cameras, self.backend, background, self.near, FAR, settings)
+        return render(gaussians, cameras, self.backend, background, self.near, settings)
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     """Raise InputError if shapes of Gaussians and cameras are inconsistent, or a camera has skew."""
     count = len(gaussians)
     shapes = {"means": (count, 3), "quaternions": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    shapes["colors"] = (count, 3)
     for name, shape in shapes.items():
         found = tuple(getattr(gaussians, name).shape)
         require(found == shape, f"gaussians.{name}", f"shape {shape}", found)
-    found = tuple(gaussians.colors.shape)
-    require(len(found) == 2 and found[0] == count, "gaussians.colors", f"shape ({count}, channels)", found)
     adds_up = sum(gaussians.splits) == count and min(gaussians.splits, default=0) >= 0
     require(adds_up, "gaussians.splits", f"counts that add up to {count}", gaussians.splits)
     found = tuple(cameras.shape)
@@ -204,7 +198,7 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
     return gaussians, dataclasses.replace(cameras, extrinsics=extrinsics)
 
 
-def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor:
+def _background(background: Background, color: Float[Tensor, "B T 3 h w"]) -> Tensor:
     """Convert a background to a tensor that broadcasts with the image ``color``.
 
     Raises:
@@ -212,8 +206,6 @@ def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Te
     """
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
     if tensor.ndim == 1:
-        channels = color.shape[2]
-        fits = len(tensor) in (1, channels)
-        require(fits, "renderer.background", f"{channels} channels", len(tensor))
+        require(len(tensor) in (1, 3), "renderer.background", "3 channels", len(tensor))
         return tensor[:, None, None]
     return tensor

@@ -21,7 +21,8 @@ _ALPHA_MAX = RasterSettings().alpha_max
 #: Threads of a warp. In a batch, gsplat 1.5.3 sums gradients within a warp by a Gaussian's index in
 #: its element, which would mix elements with fewer Gaussians than this.
 _WARP = 32
-_FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
+#: Farthest depth in metres: practically no limit.
+_FAR = 1e10
 #: Versions whose kernels are known to accept these intersections.
 _KNOWN = ("1.5.3",)
 
@@ -56,9 +57,7 @@ def load() -> Any:
         ) from error
 
 
-def rasterize(
-    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
-) -> Rendering:
+def rasterize(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float) -> Rendering:
     """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
 
     A limit of alpha below :data:`_ALPHA_MAX` is applied to opacities: for opacities above it,
@@ -67,41 +66,34 @@ def rasterize(
     Args:
         gaussians: on a CUDA device, in metres.
         cameras: [B, T] on the same device, in metres.
-        settings: constants of the image; those in :data:`_FIXED` are compiled into gsplat.
+        settings: constants of the image.
         near: near plane in metres.
-        far: far plane in metres.
 
     Returns:
-        Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
+        Image [B, T, 3, h, w], alpha and expected depth [B, T, 1, h, w].
 
     Raises:
-        InputError: settings that gsplat's kernels do not support.
+        InputError: a limit of alpha that gsplat's kernels do not support.
         BackendUnavailable: gsplat cannot run on this machine.
     """
-    default = RasterSettings()
     expected = f"at most {_ALPHA_MAX}, which is compiled into gsplat"
     allowed = settings.alpha_max <= _ALPHA_MAX
     require(allowed, "renderer.settings.alpha_max", expected, settings.alpha_max)
-    for name in _FIXED:
-        value = getattr(settings, name)
-        fixed = getattr(default, name)
-        require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)
     gsplat = load()
-    channels = gaussians.colors.shape[1]
     if len(gaussians) == 0 or 0 in cameras.shape:
         # Part of the autograd graph, so that a batch of empty elements can be differentiated.
         nothing = (gaussians.means.sum() + gaussians.colors.sum()).float()
-        drawn = nothing * nothing.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
+        drawn = nothing * nothing.new_zeros(*cameras.shape, 5, cameras.height, cameras.width)
     else:
-        drawn = _render(gsplat, gaussians, cameras, settings, near, far)
-    image, depth, alpha = drawn.split((channels, 1, 1), dim=2)
+        drawn = _render(gsplat, gaussians, cameras, settings, near)
+    image, depth, alpha = drawn.split((3, 1, 1), dim=2)
     return Rendering(image=image, alpha=alpha, depth=depth)
 
 
 def _render(
-    gsplat: Any, gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
+    gsplat: Any, gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float
 ) -> Tensor:
-    """Render colours, expected depth and alpha [B, T, C + 2, h, w] of at least one Gaussian and one
+    """Render colours, expected depth and alpha [B, T, 5, h, w] of at least one Gaussian and one
     camera."""
     fields = _sanitize(*_pad_elements(gaussians))
     means, quaternions, scales, opacities, colors = fields
@@ -119,7 +111,7 @@ def _render(
         "width": cameras.width,
         "height": cameras.height,
         "near_plane": near,
-        "far_plane": far,
+        "far_plane": _FAR,
         "eps2d": settings.low_pass,
     }
     rooms = deferred.get()
@@ -140,12 +132,12 @@ def _render_without_sync(
     Args:
         gsplat: the package, of a version in :data:`_KNOWN`.
         seen: Gaussians and cameras, arguments of gsplat's ``fully_fused_projection``.
-        colors: [B, N, C].
+        colors: [B, N, 3].
         antialiased: whether to multiply opacities by gsplat's compensations.
         rooms: gets the capacity of the rendering, which may lack splats: the caller checks it.
 
     Returns:
-        Colours and expected depth [B, T, h, w, C + 1], and alpha [B, T, h, w, 1].
+        Colours and expected depth [B, T, h, w, 4], and alpha [B, T, h, w, 1].
     """
     radii, centers, depths, conics, compensations = gsplat.fully_fused_projection(
         covars=None, calc_compensations=antialiased, **seen

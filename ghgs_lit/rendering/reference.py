@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.projection import pixel_centers
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.ops.rasterization.layout import ALPHA_MIN, EXTENT, FRUSTUM_MARGIN, STOP
 from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
@@ -28,12 +29,10 @@ class Splats:
     determinants: Float[Tensor, " n"]
     depths: Float[Tensor, " n"]
     opacities: Float[Tensor, " n"]
-    colors: Float[Tensor, "n C"]
+    colors: Float[Tensor, "n 3"]
 
 
-def rasterize(
-    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
-) -> Rendering:
+def rasterize(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float) -> Rendering:
     """Render on black; see :func:`ghgs_lit.rendering.render`.
 
     Args:
@@ -41,29 +40,27 @@ def rasterize(
         cameras: [B, T], in the dtype of the means.
         settings: constants of the image.
         near: near plane, in the unit of the means.
-        far: far plane, in the unit of the means.
 
     Returns:
-        Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w], in the dtype of the means;
+        Image [B, T, 3, h, w], alpha and expected depth [B, T, 1, h, w], in the dtype of the means;
         differentiable in Gaussians and cameras.
     """
-    channels = gaussians.colors.shape[1]
     each = []
     for element in range(cameras.shape[0]):
         for view in range(cameras.shape[1]):
-            each.append(_view(gaussians[element], cameras[element, view], settings, near, far))
-    empty = gaussians.means.new_zeros(0, channels + 2, cameras.height, cameras.width)
+            each.append(_view(gaussians[element], cameras[element, view], settings, near))
+    empty = gaussians.means.new_zeros(0, 5, cameras.height, cameras.width)
     sums = torch.stack(each) if each else empty
-    image, depth, alpha = sums.unflatten(0, cameras.shape).split((channels, 1, 1), dim=2)
+    image, depth, alpha = sums.unflatten(0, cameras.shape).split((3, 1, 1), dim=2)
     return Rendering(image=image, alpha=alpha, depth=depth / alpha.clamp_min(1e-10))
 
 
 def _view(
-    gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
-) -> Float[Tensor, "channels h w"]:
-    """Sums over the Gaussians visible in each pixel of ``w colour`` (C channels), ``w z`` and ``w``,
-    for one element and one camera without batch dimensions."""
-    index = visible(gaussians, camera, settings, near, far)
+    gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float
+) -> Float[Tensor, "5 h w"]:
+    """Sums over the Gaussians visible in each pixel of ``w colour`` (3 channels), ``w z`` and ``w``, for
+    one element and one camera without batch dimensions."""
+    index = visible(gaussians, camera, settings, near)
     splats = project(gaussians.select(index, (len(index),)), camera, settings)
     centers = pixel_centers(camera.height, camera.width, splats.centers).flatten(0, 1)
     step = max(1, _CHUNK // max(1, len(splats.depths)))
@@ -73,25 +70,24 @@ def _view(
 
 @torch.no_grad()
 def visible(
-    gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
+    gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float
 ) -> Int[Tensor, " n"]:
     """Indices of the visible Gaussians, sorted by float32 depth, ties by index.
 
-    A Gaussian is visible if its centre is finite and between ``near`` and ``far``, its determinant
-    positive and finite, and its opacity at least ``alpha_min``.
+    A Gaussian is visible if its centre is finite and not nearer than ``near``, its determinant positive
+    and finite, and its opacity at least ``ALPHA_MIN``.
 
     Args:
         gaussians: of one element.
         camera: one camera, without batch dimensions.
         settings: constants of the image.
         near: near plane, in the unit of the means.
-        far: far plane, in the unit of the means.
     """
     splats = project(gaussians, camera, settings)
     depths = splats.depths
     determinants = splats.determinants
-    keep = (depths >= near) & (depths <= far) & (determinants > 0) & determinants.isfinite()
-    keep &= (splats.opacities >= settings.alpha_min) & splats.centers.isfinite().all(-1)
+    keep = (depths >= near) & (depths <= 1e10) & (determinants > 0) & determinants.isfinite()
+    keep &= (splats.opacities >= ALPHA_MIN) & splats.centers.isfinite().all(-1)
     index = keep.nonzero()[:, 0]
     return index[depths[index].float().argsort(stable=True)]
 
@@ -101,7 +97,7 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
 
     The covariance is that of EWA splatting (Zwicker et al., 2001), ``J W Sigma W^T J^T`` plus
     ``low_pass`` on its diagonal, with the Jacobian J at the centre, clamped to the frame plus
-    ``frustum_margin``.
+    ``FRUSTUM_MARGIN``.
     """
     rotation = camera.extrinsics[:3, :3]
     translation = camera.extrinsics[:3, 3]
@@ -110,7 +106,7 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
     focal = camera.intrinsics.diagonal()[:2]
     center = camera.intrinsics[:2, 2]
     size = focal.new_tensor([camera.width, camera.height])
-    margin = settings.frustum_margin * 0.5 * size / focal
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
     tangents = torch.stack((x / z, y / z), dim=-1)
     low = -center / focal - margin
     high = (size - center) / focal + margin
@@ -142,14 +138,14 @@ def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSetting
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, _ = splats.covariances[:, None].unbind(-1)
     sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats.determinants[:, None])
-    near_enough = sigma <= 0.5 * settings.extent**2
+    near_enough = sigma <= 0.5 * EXTENT**2
     raw = splats.opacities[:, None] * torch.exp(-torch.where(near_enough, sigma, 0))
     # A clamped alpha has no gradient, not even at equality.
     alpha = torch.where(raw < settings.alpha_max, raw, settings.alpha_max)
-    hit = near_enough & (alpha >= settings.alpha_min)
+    hit = near_enough & (alpha >= ALPHA_MIN)
     behind = torch.log1p(-torch.where(hit, alpha, 0)).cumsum(0)
     # Transmittance only decreases, so all splats after the first skipped one are skipped, too.
-    seen = hit & (behind > (math.log(settings.stop) if settings.stop > 0 else -math.inf))
+    seen = hit & (behind > (math.log(STOP) if STOP > 0 else -math.inf))
     alpha = torch.where(seen, alpha, 0)
     step = torch.log1p(-alpha)
     weights = alpha * torch.exp(step.cumsum(0) - step)

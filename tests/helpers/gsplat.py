@@ -36,9 +36,7 @@ class Documented:
         fields = (x.flatten(0, 1) for x in (means, quats, scales, opacities, colors))
         gaussians = Gaussians(*fields, splits=(count,) * batch)
         settings = RasterSettings(low_pass=eps2d, antialiased=rasterize_mode == "antialiased")
-        drawn = reference.rasterize(
-            gaussians, Cameras(Ks, viewmats, height, width), settings, near_plane, far_plane
-        )
+        drawn = reference.rasterize(gaussians, Cameras(Ks, viewmats, height, width), settings, near_plane)
         values = torch.cat((drawn.image, drawn.depth), dim=2).permute(0, 1, 3, 4, 2)
         return values, drawn.alpha.permute(0, 1, 3, 4, 2), {}
 

@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
+from unittest import mock
 
 import torch
 from torch import Tensor
 
-from ghgs_lit.rendering import RasterSettings, render
+from ghgs_lit.rendering import RasterSettings, reference, render
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 from tests.helpers import cameras
 
@@ -31,9 +32,7 @@ def camera_ring(
     return cameras.camera_ring(views, height, width, batch, focal, principal, **place)
 
 
-def cloud(
-    count: int, seed: int = 0, size: float = 0.05, channels: int = 3, splits: tuple | None = None
-) -> Gaussians:
+def cloud(count: int, seed: int = 0, size: float = 0.05, splits: tuple | None = None) -> Gaussians:
     """Random Gaussians around the origin, of all shapes and orientations."""
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
@@ -41,7 +40,7 @@ def cloud(
         quaternions=torch.randn(count, 4, generator=generator),
         scales=size * torch.rand(count, 3, generator=generator) + 0.1 * size,
         opacities=torch.rand(count, generator=generator),
-        colors=torch.rand(count, channels, generator=generator),
+        colors=torch.rand(count, 3, generator=generator),
         splits=(count,) if splits is None else splits,
     )
 
@@ -89,14 +88,12 @@ def ambiguous(gaussians: Gaussians, views: Cameras, settings: RasterSettings, **
     They change if the thresholds move by slightly more than the rounding error of float32.
     """
     images = []
+    double = (gaussians.to(torch.float64) if gaussians.means.dtype != torch.float64 else gaussians).detach()
     for sign in (-1, 1):
-        moved = settings.replace(
-            alpha_min=settings.alpha_min * (1 + sign * 1e-5),
-            stop=settings.stop * (1 + sign * 1e-3),
-            extent=settings.extent * (1 + sign * 1e-6),
-        )
-        double = gaussians.to(torch.float64) if gaussians.means.dtype != torch.float64 else gaussians
-        images.append(render(double.detach(), views, "reference", settings=moved, **options))
+        moved = {"ALPHA_MIN": 1 + sign * 1e-5, "STOP": 1 + sign * 1e-3, "EXTENT": 1 + sign * 1e-6}
+        moved = {name: getattr(reference, name) * factor for name, factor in moved.items()}
+        with mock.patch.multiple(reference, **moved):
+            images.append(render(double, views, "reference", settings=settings, **options))
     difference = (images[0].alpha - images[1].alpha).abs() + (images[0].image - images[1].image).abs().sum(
         2, True
     )
@@ -144,10 +141,9 @@ def assert_cpu_matches_reference(
     assert unsure.double().mean() <= ambiguous_budget
     generator = torch.Generator().manual_seed(7)
     shape = (*views.shape, 1, views.height, views.width)
-    channels = gaussians.colors.shape[1]
     weights = [
         torch.randn((*shape[:2], c, *shape[3:]), generator=generator, dtype=torch.float64) * ~unsure
-        for c in (channels, 1, 1)
+        for c in (3, 1, 1)
     ]
     truth, true_gradients = differentiate(
         gaussians, views, "reference", torch.float64, weights, settings=settings, **options

@@ -25,11 +25,7 @@ from tests.helpers.splats import camera_ring, cloud
         (Renderer, {"alpha_mx": 0.9}, "renderer key: .*did you mean alpha_max"),
         (RasterSettings, {"low_pass": -1.0}, "low_pass"),
         (RasterSettings, {"alpha_max": 1.0}, "alpha_max"),
-        (
-            RasterSettings,
-            {"alpha_min": 0.9999},
-            r"alpha_min: .* alpha_max = 0\.999; found 0\.9999",
-        ),
+        (RasterSettings, {"alpha_max": 0.003}, "alpha_max"),
         (RasterSettings, {"antialiased": 1}, "antialiased"),
         (RasterSettings, {"lowpass": 0.3}, "lowpass"),
     ],
@@ -39,11 +35,11 @@ def test_impossible_options_are_refused_by_name(kind, options, key):
         kind(**options)
 
 
-@pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (float("nan"), 1.0), (1.0, float("inf"))])
-def test_an_impossible_range_of_depths_is_refused(near, far):
-    """Such a range would render nothing, or Gaussians behind the camera."""
-    with pytest.raises(InputError, match=r"near|far"):
-        render(cloud(5), camera_ring(1, 20, 30), "cpu", near=near, far=far)
+@pytest.mark.parametrize("near", [0.0, float("nan"), float("inf")])
+def test_an_impossible_near_plane_is_refused(near):
+    """It would render nothing, or Gaussians behind the camera."""
+    with pytest.raises(InputError, match="near"):
+        render(cloud(5), camera_ring(1, 20, 30), "cpu", near=near)
 
 
 def test_auto_is_the_cpu_backend_for_cpu_tensors():
@@ -160,7 +156,7 @@ def test_elements_of_worlds_far_apart_are_drawn_as_near_the_origin(backend):
 def test_the_worlds_unit_changes_no_image(backend):
     """With ``metre`` set, a world in millimetres gives the same image, and 1000 times the depth."""
     splats, views = cloud(20, splits=(12, 8)), camera_ring(2, 20, 30, batch=2)
-    expected = render(splats, views, backend, near=2.5, far=3.2)
+    expected = render(splats, views, backend, near=2.5)
     units = torch.tensor([1.0, 1000.0])
     lengths = torch.tensor([1.0] * 12 + [1000.0] * 8)[:, None]
     extrinsics = views.extrinsics.clone()
@@ -168,16 +164,16 @@ def test_the_worlds_unit_changes_no_image(backend):
     large = dataclasses.replace(
         splats, means=splats.means * lengths, scales=splats.scales * lengths, metre=units
     )
-    found = render(large, dataclasses.replace(views, extrinsics=extrinsics), backend, near=2.5, far=3.2)
+    found = render(large, dataclasses.replace(views, extrinsics=extrinsics), backend, near=2.5)
     torch.testing.assert_close(found.image, expected.image, atol=1e-4, rtol=0)
     unit = units[:, None, None, None, None]
     torch.testing.assert_close(found.depth / unit, expected.depth, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize(("near", "far", "drawn"), [(0.5, 2.0, 0), (1.5, 4.0, 1), (1.0, 3.0, 2)])
-def test_near_and_far_are_depths_of_centres(backend, near, far, drawn):
-    """Of two splats 1 m and 3 m away, those within the range, its ends included, are rendered."""
+@pytest.mark.parametrize(("near", "drawn"), [(0.5, (0, 1)), (1.0, (0, 1)), (1.5, (1,)), (3.5, ())])
+def test_near_is_a_depth_of_centres(backend, near, drawn):
+    """Of two splats 1 m and 3 m away, those from ``near`` on, itself included, are rendered."""
     two = unturned([[-0.2, 0, 1.0], [0.6, 0, 3.0]], 0.05, torch.eye(3)[:2])
-    found = render(two, one_camera(20), backend, near=near, far=far).image[0, 0].flatten(1).sum(1)
-    assert (found[:2] > 0.5).tolist() == [drawn in (0, 2), drawn in (1, 2)]
+    found = render(two, one_camera(20), backend, near=near).image[0, 0].flatten(1).sum(1)
+    assert (found[:2] > 0.5).tolist() == [0 in drawn, 1 in drawn]

@@ -93,9 +93,9 @@ def test_a_broken_gsplat_says_why_it_cannot_be_loaded(monkeypatch, broken):
 
 
 def test_gsplat_refuses_constants_it_does_not_know():
-    """Constants that are compiled into gsplat cannot be changed silently."""
-    with pytest.raises(ValueError, match="renderer"):
-        render(cloud(5), camera_ring(1, 8, 8), "gsplat", settings=RasterSettings(stop=0.5))
+    """A constant that is compiled into gsplat cannot be changed silently."""
+    with pytest.raises(ValueError, match="alpha_max"):
+        gsplat_backend.rasterize(cloud(5), camera_ring(1, 8, 8), RasterSettings(alpha_max=0.9999), 0.5)
 
 
 @pytest.fixture(autouse=True)
@@ -117,8 +117,8 @@ def test_gsplat_is_called_as_documented(monkeypatch, gsplat, antialiased):
     gaussians.opacities[15:] = 1  # gsplat limits alpha itself, not opacity
     settings = RasterSettings(low_pass=0.2, antialiased=antialiased)
     gaussians = with_gradients(gaussians)
-    found = repeat_until_sufficient(partial(gsplat_backend.rasterize, gaussians, views, settings, 0.5, 20.0))
-    wanted = render(gaussians, views, "cpu", settings=settings, near=0.5, far=20.0)
+    found = repeat_until_sufficient(partial(gsplat_backend.rasterize, gaussians, views, settings, 0.5))
+    wanted = render(gaussians, views, "cpu", settings=settings, near=0.5)
     for name in ("image", "alpha", "depth"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4)
     found.image.sum().backward()
@@ -133,7 +133,7 @@ def test_the_gradient_in_parts_is_that_of_the_reference(monkeypatch):
     slopes = []
     for module in (gsplat_backend, reference):
         leaves = with_gradients(gaussians)
-        draw = partial(module.rasterize, leaves, views, RasterSettings(), 0.5, 20.0)
+        draw = partial(module.rasterize, leaves, views, RasterSettings(), 0.5)
         image = repeat_until_sufficient(draw).image
         (image * weights).sum().backward()
         slopes.append(leaves)

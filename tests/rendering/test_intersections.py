@@ -99,8 +99,8 @@ def capacities(monkeypatch):
 
 def drawn(size=0.3):
     gaussians, views = cloud(60, splits=(35, 25), size=size), camera_ring(2, 70, 90, batch=2)
-    found = gsplat_backend.rasterize(gaussians, views, RasterSettings(), 0.5, 20.0)
-    return found, reference.rasterize(gaussians, views, RasterSettings(), 0.5, 20.0)
+    found = gsplat_backend.rasterize(gaussians, views, RasterSettings(), 0.5)
+    return found, reference.rasterize(gaussians, views, RasterSettings(), 0.5)
 
 
 def test_an_image_is_drawn_again_where_splats_lacked_room(capacities):

@@ -13,9 +13,11 @@ from tests.helpers.splats import FIELDS, camera_ring, cloud
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_of_the_reference_are_those_of_its_values(antialiased):
+def test_gradients_of_the_reference_are_those_of_its_values(monkeypatch, antialiased):
     """Gradients match finite differences where no threshold causes steps."""
-    settings = RasterSettings(alpha_min=1e-12, stop=0.0, extent=30.0, antialiased=antialiased)
+    for name, value in {"ALPHA_MIN": 1e-12, "STOP": 0.0, "EXTENT": 30.0}.items():
+        monkeypatch.setattr(reference, name, value)
+    settings = RasterSettings(antialiased=antialiased)
     gaussians = cloud(4, size=0.3, splits=(3, 1))
     views = camera_ring(1, 3, 4, batch=2).to(torch.float64)
 
@@ -33,7 +35,7 @@ def test_splats_are_composited_front_to_back_with_every_threshold():
     settings = RasterSettings()
     gaussians, views = cloud(120, size=0.4).to(torch.float64), camera_ring(1, 9, 11).to(torch.float64)
     rendering = render(gaussians, views, "reference", settings=settings)
-    index = reference.visible(gaussians, views[0, 0], settings, 0.01, 1e10)
+    index = reference.visible(gaussians, views[0, 0], settings, 0.01)
     splats = reference.project(gaussians.select(index, (len(index),)), views[0, 0], settings)
     depths = splats.depths.tolist()
     assert depths == sorted(depths)
@@ -47,9 +49,9 @@ def test_splats_are_composited_front_to_back_with_every_threshold():
             offset = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64) - splats.centers[k]
             sigma = float(0.5 * offset @ torch.linalg.solve(covariance, offset))
             alpha = min(settings.alpha_max, float(splats.opacities[k]) * math.exp(-sigma))
-            if alpha < settings.alpha_min:
+            if alpha < reference.ALPHA_MIN:
                 continue
-            if transmittance * (1 - alpha) <= settings.stop:
+            if transmittance * (1 - alpha) <= reference.STOP:
                 stopped += 1
                 break
             weight = transmittance * alpha

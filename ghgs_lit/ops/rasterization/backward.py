@@ -10,7 +10,7 @@ import numpy as np
 from ghgs_lit.ops import memory, simd
 from ghgs_lit.ops.compile import helper, kernel
 from ghgs_lit.ops.rasterization import layout, tables, tiles
-from ghgs_lit.ops.rasterization.tiles import BLOCKS, LANES, LEAST_ALPHA, ONE, ZERO
+from ghgs_lit.ops.rasterization.tiles import BLOCKS, LANES, LEAST_ALPHA, ONE, PLANES, ZERO
 
 # Distance in entries from a splat that is read to the one that is prefetched.
 _AHEAD = 8
@@ -33,8 +33,8 @@ def _read(image, first, width, rows, columns, block):
 
 @helper
 def _read_gradients(
-    view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth,
-    upstream, suffix,
+    view, first, height, width, rows, columns, image, alpha, depth, d_image, d_alpha, d_depth, upstream,
+    suffix,
 ):  # fmt: skip
     """Fill ``upstream`` with the gradients of a tile's planes, and ``suffix`` with ``S`` of all splats.
 
@@ -48,26 +48,24 @@ def _read_gradients(
         width: image width in pixels.
         rows: rows of the tile inside the image.
         columns: columns of the tile inside the image.
-        count: number of channels C, or a tuple of that length.
-        image: flat [V C h w].
+        image: flat [V 3 h w].
         alpha: flat [V h w].
         depth: expected depth, flat [V h w].
-        d_image: gradient of the image, flat [V C h w].
+        d_image: gradient of the image, flat [V 3 h w].
         d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
         d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
-        upstream: written, gradients of the planes (C colours, ``w z``, ``w``), [(C + 2) PIXELS],
-            block by block.
+        upstream: written, gradients of the planes (colour, ``w z``, ``w``), [PLANES x PIXELS], block by
+            block.
         suffix: written, ``S``, [PIXELS], block by block.
     """
-    channels = simd.length(count)
     start = view * height * width + first
     for block in range(BLOCKS):
         at = block * LANES
         total = simd.full(ZERO)
         d_sum = simd.full(ZERO)
         d_total = simd.full(ZERO)
-        for c in range(channels):
-            plane = (view * channels + c) * height * width + first
+        for c in range(layout.CHANNELS):
+            plane = (view * layout.CHANNELS + c) * height * width + first
             slope = _read(d_image, plane, width, rows, columns, block)
             total = simd.fma(slope, _read(image, plane, width, rows, columns, block), total)
             memory.store(upstream, c * layout.PIXELS + at, slope)
@@ -82,24 +80,19 @@ def _read_gradients(
             free = seen > LEAST_ALPHA
             d_total = simd.select(free, d_total - product / seen, d_total)
             total = simd.select(free, total, total + product)
-        memory.store(upstream, channels * layout.PIXELS + at, d_sum)
-        memory.store(upstream, (channels + 1) * layout.PIXELS + at, d_total)
+        memory.store(upstream, layout.CHANNELS * layout.PIXELS + at, d_sum)
+        memory.store(upstream, (layout.CHANNELS + 1) * layout.PIXELS + at, d_total)
         memory.store(suffix, at, total)
 
 
 @helper
-def _differentiate_splat(
-    records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
-):
+def _differentiate_splat(records, s, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max):
     """Compute the gradients of one entry (a splat in a tile), and advance ``transmittance`` and
     ``suffix`` past the splat.
 
     Args:
         records: [splats, RECORD].
         s: index of the splat.
-        colors: [N, C].
-        n: index of the splat's Gaussian.
-        count: number of channels C, or a tuple of that length.
         x0: first column of the tile, in pixels.
         y0: first row of the tile, in pixels.
         hit: bit mask of the blocks that the splat reaches.
@@ -110,9 +103,7 @@ def _differentiate_splat(
         sums: written, a row of 16 lanes for each gradient of an entry (see ``layout``), to be
             summed over lanes.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel terminates.
     """
-    channels = simd.length(count)
     zero = simd.full(ZERO)
     numbers = tiles.read_splat(records[s], np.float32(x0), np.float32(y0))
     depth = records[s, layout.DEPTH]
@@ -123,7 +114,7 @@ def _differentiate_splat(
     h_pq = zero
     h_qq = zero
     d_depth = zero
-    for c in range(channels):
+    for c in range(layout.CHANNELS):
         memory.store(sums, (layout.COLOR + c) * LANES, zero)
     while hit != 0:
         block = simd.trailing_zeros(hit)
@@ -133,15 +124,15 @@ def _differentiate_splat(
         dy = numbers[1] + memory.load(pixels, layout.PIXELS + at)
         p, q = tiles.whiten(numbers, dx, dy)
         before = memory.load(transmittance, at)
-        raw, alpha, _, seen, _, left = tiles.blend(numbers, p, q, before, alpha_max, stop)
+        raw, alpha, _, seen, _, left = tiles.blend(numbers, p, q, before, alpha_max)
         memory.store(transmittance, at, left)
         weight = simd.select(seen, before * alpha, ZERO)
-        d_sum = memory.load(upstream, channels * layout.PIXELS + at)
-        value = simd.fma(d_sum, depth, memory.load(upstream, (channels + 1) * layout.PIXELS + at))
+        d_sum = memory.load(upstream, layout.CHANNELS * layout.PIXELS + at)
+        value = simd.fma(d_sum, depth, memory.load(upstream, (layout.CHANNELS + 1) * layout.PIXELS + at))
         d_depth = simd.fma(weight, d_sum, d_depth)
-        for c in range(channels):
+        for c in range(layout.CHANNELS):
             slope = memory.load(upstream, c * layout.PIXELS + at)
-            value = simd.fma(slope, tiles.color(records, s, colors, n, c, count), value)
+            value = simd.fma(slope, records[s, layout.COLORS + c], value)
             row = (layout.COLOR + c) * LANES
             memory.store(sums, row, simd.fma(weight, slope, memory.load(sums, row)))
         rest = memory.load(suffix, at) - simd.select(seen, weight * value, ZERO)
@@ -168,8 +159,8 @@ def _differentiate_splat(
 
 @kernel
 def backward(
-    some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
-    alpha_max, stop, drawn, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
+    some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, records, alpha_max, drawn,
+    image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
     """Write the gradients of the rendered entries of tiles.
 
@@ -182,49 +173,39 @@ def backward(
         views: cameras, float64 [V, VIEW].
         tile_starts: first entry of each tile, int64 [V tiles + 1].
         entries: int32 [entries, ENTRY], in the order in which ``forward`` left them.
-        shifts: splat index minus Gaussian index in each view, int64 [V].
         records: [splats, RECORD].
-        colors: [N, C].
-        count: number of channels C, or a tuple of that length.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel terminates.
         drawn: number of rendered entries of each tile, int64 [V tiles].
-        image: rendered colours, flat [V C h w].
+        image: rendered colours, flat [V 3 h w].
         alpha: rendered alpha, flat [V h w].
         depth: rendered depth, flat [V h w].
-        d_image: gradient of the image, flat [V C h w].
+        d_image: gradient of the image, flat [V 3 h w].
         d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
         d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
-        gradients: written by slot, flat [slots x gradient_width], aligned to a cache line.
+        gradients: written by slot, flat [slots x GRADIENT], aligned to a cache line.
     """
-    channels = simd.length(count)
     transmittance = simd.aligned(layout.PIXELS)
     suffix = simd.aligned(layout.PIXELS)
-    upstream = simd.aligned((channels + 2) * layout.PIXELS)
-    stride = layout.kernel_gradient_width(channels)
-    sums = simd.aligned(stride * LANES)
+    upstream = simd.aligned(PLANES * layout.PIXELS)
+    sums = simd.aligned(layout.GRADIENT * LANES)
     pixels = tiles.grid()
-    sums[:] = ZERO
     for tile in some_tiles:
         view, x0, y0, rows, columns, first = tiles.place(tile, tiles_x, tiles_y, height, width)
         _read_gradients(
-            view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha,
-            d_depth, upstream, suffix,
+            view, first, height, width, rows, columns, image, alpha, depth, d_image, d_alpha, d_depth,
+            upstream, suffix,
         )  # fmt: skip
         tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
         start = tile_starts[tile]
         end = tile_starts[tile] + drawn[tile]
         for entry in range(start, end):
             later = min(entry + _AHEAD, end - 1)
-            s = entries[later, layout.SPLAT]
-            tiles.prefetch(records, s, colors, s - shifts[view])
-            memory.prefetch(gradients, entries[later, layout.SLOT] * stride)
+            memory.prefetch(records, entries[later, layout.SPLAT] * layout.RECORD)
+            memory.prefetch(gradients, entries[later, layout.SLOT] * layout.GRADIENT)
             s = entries[entry, layout.SPLAT]
             hit = np.int64(entries[entry, layout.BLOCKS])
             _differentiate_splat(
-                records, s, colors, s - shifts[view], count, x0, y0, hit, pixels, transmittance, upstream,
-                suffix, sums, alpha_max, stop,
-            )  # fmt: skip
-            slot = entries[entry, layout.SLOT] * stride
-            for k in range(0, stride, LANES):
-                memory.store(gradients, slot + k, tables.row_sums(sums, k * LANES, count))
+                records, s, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max
+            )
+            slot = entries[entry, layout.SLOT]
+            memory.store(gradients, slot * layout.GRADIENT, tables.row_sums(sums))

@@ -1,8 +1,9 @@
 """The CPU rasterizer as a differentiable PyTorch function."""
 
 import threading
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,93 +19,48 @@ from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Division of the work of a call, independent of the values of the Gaussians.
+class _Part(NamedTuple):
+    """Gaussians of an element that one task processes, with the cameras that see them."""
 
-    View ``v`` belongs to batch element ``v // T``.
-
-    Attributes:
-        views: cameras as rows of ``layout.VIEW`` doubles, [B T, VIEW].
-        edges: boundaries of the P parts of each element, as indices of Gaussians, [B, P + 1].
-        shifts: Gaussian ``n`` is splat ``n + shifts[v]`` of view ``v``, [B T].
-        splats: number of splats in all views.
-        shape: (B, T).
-        height: image height in pixels.
-        width: image width in pixels.
-        settings: constants of rendering.
-        near: smallest rendered depth of a centre, in metres.
-        far: largest rendered depth of a centre, in metres.
-    """
-
+    place: tuple[int, int]
+    """Batch element, and index of the part in it."""
+    first: int
+    last: int
+    """End of the Gaussians, excluded."""
     views: np.ndarray
-    edges: np.ndarray
+    """Cameras as rows of ``layout.VIEW`` doubles, [T, VIEW]."""
     shifts: np.ndarray
-    splats: int
-    shape: tuple[int, int]
-    height: int
-    width: int
-    settings: RasterSettings
-    near: float
-    far: float
-
-    @classmethod
-    def of(cls, gaussians, cameras, settings, near, far) -> "Plan":
-        """Make the plan; it depends on the cameras and on the numbers of Gaussians.
-
-        Args:
-            gaussians: N Gaussians of B elements.
-            cameras: [B, T].
-            settings: constants of rendering.
-            near: smallest rendered depth of a centre, in metres.
-            far: largest rendered depth of a centre, in metres.
-        """
-        counts = np.array(gaussians.splits, dtype=np.int64)
-        views_each = cameras.shape[1]
-        firsts = np.cumsum(counts) - counts
-        # Each view has whole vectors of splats, so that no two threads write to the same vector.
-        sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
-        views = _view_rows(cameras, settings)
-        edges = _part_edges(firsts, counts)
-        shifts = np.cumsum(sizes) - sizes - np.repeat(firsts, views_each)
-        numbers = int(sizes.sum()), tuple(cameras.shape), cameras.height, cameras.width
-        return cls(views, edges, shifts, *numbers, settings, near, far)
-
-    @property
-    def tiles(self) -> tuple[int, int]:
-        """Number of tiles across and down a view."""
-        return -(-self.width // layout.TILE), -(-self.height // layout.TILE)
-
-    @property
-    def constants(self) -> tuple[np.float32, np.float32]:
-        """``alpha_max`` and ``stop``."""
-        return np.float32(self.settings.alpha_max), np.float32(self.settings.stop)
-
-    @property
-    def parts(self) -> list[tuple[int, int, int, int, slice]]:
-        """Non-empty parts as (batch element, part, first Gaussian, end, views of the element)."""
-        views = self.shape[1]
-        parts = []
-        for b, edges in enumerate(self.edges):
-            seen_by = slice(b * views, (b + 1) * views)
-            for p in range(len(edges) - 1):
-                if edges[p] < edges[p + 1]:
-                    parts.append((b, p, int(edges[p]), int(edges[p + 1]), seen_by))
-        return parts
+    """Gaussian ``n`` is splat ``n + shifts[t]`` of camera ``t``, [T]."""
 
 
-def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Boundaries [B, P + 1] of the parts of each element, of which all but the last are whole vectors,
-    from the first Gaussians and the counts of the elements, [B]."""
+def _divide(splits: Sequence[int], views: np.ndarray) -> tuple[list[_Part], int, int]:
+    """Divide the Gaussians of each element into parts of whole vectors (all but the last).
+
+    Args:
+        splits: number of Gaussians of each element.
+        views: cameras [B, T, VIEW].
+
+    Returns:
+        Parts, largest number of parts of an element, and number of splats in all views.
+    """
+    counts = np.array(splits, dtype=np.int64)
+    firsts = np.cumsum(counts) - counts
+    # Each view has whole vectors of splats, so that no two threads write to the same vector.
+    sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views.shape[1])
+    shifts = (np.cumsum(sizes) - sizes).reshape(views.shape[:2]) - firsts[:, None]
     threads = torch.get_num_threads()
     total = int(counts.sum())
-    parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
-    steps = -(-counts // (parts * simd.DOUBLES)) * simd.DOUBLES
-    edges = np.minimum(steps[:, None] * np.arange(parts + 1), counts[:, None])
-    return edges + firsts[:, None]
+    each = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
+    parts = []
+    for b, (first, count) in enumerate(zip(firsts.tolist(), counts.tolist(), strict=True)):
+        step = -(-count // (each * simd.DOUBLES)) * simd.DOUBLES
+        for p, begin in enumerate(range(0, count, step or 1)):
+            end = min(begin + step, count)
+            parts.append(_Part((b, p), first + begin, first + end, views[b], shifts[b]))
+    return parts, each, int(sizes.sum())
 
 
-def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
+def _view_rows(cameras: Cameras) -> np.ndarray:
     """Cameras as rows of ``layout.VIEW`` doubles, [B T, VIEW]."""
     intrinsics = cameras.intrinsics.detach().double().flatten(0, -3).numpy()
     extrinsics = cameras.extrinsics.detach().double().flatten(0, -3).numpy()
@@ -113,7 +69,7 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
     for axis, size, low in sides:
         focal = intrinsics[:, axis, axis]
         center = intrinsics[:, axis, 2]
-        margin = settings.frustum_margin * 0.5 * size / focal
+        margin = layout.FRUSTUM_MARGIN * 0.5 * size / focal
         rows[:, layout.FX + axis] = focal
         rows[:, layout.CX + axis] = center
         rows[:, low] = -center / focal - margin
@@ -127,15 +83,11 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
 
 # Runs of tiles per thread: several short runs balance the load of the threads.
 _RUNS = 8
-# Kernels are specialised for this number of channels, and compiled once for all others.
-_COLORS = 3
 # Limit in bytes of the tile lists and their gradients: a splat that fills the frame is in every list.
 _MEMORY = 1 << 32
 
 
-def rasterize(
-    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
-) -> Rendering:
+def rasterize(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float) -> Rendering:
     """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
 
     Differentiable with respect to the Gaussians, not the cameras. The result is bitwise the same for
@@ -146,99 +98,91 @@ def rasterize(
         cameras: [B, T], in metres.
         settings: constants of rendering.
         near: smallest rendered depth of a centre, in metres.
-        far: largest rendered depth of a centre, in metres.
 
     Returns:
-        Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
+        Image [B, T, 3, h, w], alpha and expected depth [B, T, 1, h, w].
 
     Raises:
         InputError: the tile lists would exceed 4 GiB (``_MEMORY``).
     """
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-    plan = Plan.of(gaussians, cameras, settings, near, far)
-    return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
+    fields = [field.float().contiguous() for field in fields]
+    return Rendering(*_Rasterize.apply(*fields, gaussians.splits, cameras, settings, near))
 
 
-@dataclass
-class _Splats:
-    """Splats of all views and entries of all tiles; see ``layout``.
-
-    Attributes:
-        records: [splats, RECORD], float32.
-        boxes: tiles that a splat touches, [splats, 4], int32.
-        entry_starts: first slot of each splat, [splats], int32.
-        tile_starts: first entry of each tile of each view, [B T tiles + 1], int64.
-        entries: [entries, ENTRY], int32.
-        drawn: number of rendered entries of each tile, [B T tiles], int64.
-        reached: whether an entry was rendered, by slot, [entries], uint8.
-    """
+class _Splats(NamedTuple):
+    """Splats of all views and entries of all tiles; see ``layout``."""
 
     records: np.ndarray
+    """[splats, RECORD], float32."""
     boxes: np.ndarray
+    """Tiles that a splat touches, [splats, 4], int32."""
     entry_starts: np.ndarray
+    """First slot of each splat, [splats], int32."""
     tile_starts: np.ndarray
+    """First entry of each tile of each view, [B T tiles + 1], int64."""
     entries: np.ndarray
-    drawn: np.ndarray
-    reached: np.ndarray
+    """[entries, ENTRY], int32."""
 
 
-def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differentiable: bool) -> _Splats:
+def _list_splats(
+    arrays: Sequence[np.ndarray],
+    views: np.ndarray,
+    parts: list[_Part],
+    shape: tuple[int, int],
+    total: int,
+    tiles: tuple[int, int],
+    options: tuple[float, bool, float],
+    differentiable: bool,
+) -> _Splats:
     """Project all Gaussians into their views and list the splats of each tile.
 
     Args:
-        plan: division of the work.
-        means: in metres, float32 [N, 3].
-        quaternions: wxyz of any length, float32 [N, 4].
-        scales: standard deviations in metres, float32 [N, 3].
-        opacities: float32 [N, 1].
-        colors: float32 [N, C].
+        arrays: means, quaternions, scales, opacities [N, 1] and colours, float32.
+        views: cameras [B T, VIEW].
+        parts: division of the work.
+        shape: number of elements, and largest number of parts of an element.
+        total: number of splats in all views.
+        tiles: number of tiles across and down a view.
+        options: added variance in px^2, whether opacity is scaled by the determinants, and ``near``.
         differentiable: count the memory of the gradients as well.
 
     Raises:
         InputError: the lists and, if ``differentiable``, their gradients would exceed ``_MEMORY``.
     """
-    settings = plan.settings
-    tiles_x, tiles_y = plan.tiles
-    total = plan.splats
-    elements, views = plan.shape
-    parts = plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
     depths = np.empty((total, 1), np.float32)
     boxes = np.empty((total, 4), np.int32)
-    counts = np.zeros((elements, plan.edges.shape[1] - 1, views, tiles_x * tiles_y), np.int64)
+    counts = np.zeros((*shape, len(views) // max(1, shape[0]), tiles[0] * tiles[1]), np.int64)
     pool.run([
         partial(
-            projection.project, means, quaternions, scales, opacities, colors, first, last,
-            plan.views[seen_by], plan.shifts[seen_by], plan.near, plan.far, settings.low_pass,
-            settings.extent, settings.alpha_min, settings.antialiased, tiles_x, records, depths, boxes,
-            counts[b, p],
+            projection.project, *arrays, *part[1:], *options, tiles[0], records, depths, boxes,
+            counts[part.place],
         )
-        for b, p, first, last, seen_by in parts
+        for part in parts
     ], total)  # fmt: skip
     tile_starts = np.concatenate(([0], counts.sum(1).reshape(-1).cumsum()))
     of_parts = counts.sum((2, 3))
-    slots = np.cumsum(of_parts).reshape(of_parts.shape) - of_parts
+    slots = np.cumsum(of_parts).reshape(shape) - of_parts
     size = int(tile_starts[-1])
-    each = 4 * (layout.ENTRY + (layout.gradient_width(colors.shape[1]) if differentiable else 0))
+    each = 4 * (layout.ENTRY + (layout.GRADIENT if differentiable else 0))
     require(
         size * each <= _MEMORY,
         "renderer.backend=cpu",
         f"lists of tiles of {_MEMORY / 2**30:g} GiB at most (smaller splats, fewer or smaller views)",
-        f"{size * each / 2**30:.1f} GiB: {size} entries, {size // max(len(means), 1)} of each Gaussian",
+        f"{size * each / 2**30:.1f} GiB: {size} entries, {size // max(len(arrays[0]), 1)} of each Gaussian",
     )
-    next_free = tile_starts[:-1].reshape(elements, 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
+    next_free = tile_starts[:-1].reshape(shape[0], 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
     entries = np.empty((size, layout.ENTRY), np.int32)
     entry_starts = np.empty(total, np.int32)
     pool.run([
         partial(
-            scatter, first, last, plan.shifts[seen_by], depths, boxes, tiles_x, slots[b, p], entry_starts,
-            next_free[b, p], entries,
+            scatter, part.first, part.last, part.shifts, depths, boxes, tiles[0], slots[part.place],
+            entry_starts, next_free[part.place], entries,
         )
-        for b, p, first, last, seen_by in parts
+        for part in parts
     ], size)  # fmt: skip
-    drawn = np.zeros(len(tile_starts) - 1, np.int64)
-    reached = np.zeros(size, np.uint8)
-    return _Splats(records, boxes, entry_starts, tile_starts, entries, drawn, reached)
+    return _Splats(records, boxes, entry_starts, tile_starts, entries)
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
@@ -255,7 +199,9 @@ def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, colors, plan: Plan):
+    def forward(
+        ctx, means, quaternions, scales, opacities, colors, splits, cameras, settings: RasterSettings, near
+    ):
         """Render all views.
 
         Args:
@@ -264,33 +210,38 @@ class _Rasterize(torch.autograd.Function):
             quaternions: wxyz of any length, float32 [N, 4].
             scales: standard deviations in metres, float32 [N, 3].
             opacities: float32 [N].
-            colors: float32 [N, C].
-            plan: division of the work.
+            colors: float32 [N, 3].
+            splits: number of Gaussians of each element.
+            cameras: [B, T].
+            settings: constants of rendering.
+            near: smallest rendered depth of a centre, in metres.
 
         Returns:
-            Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
+            Image [B, T, 3, h, w], alpha and expected depth [B, T, 1, h, w].
         """
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
-        splats = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
-        channels = colors.shape[1]
-        size = (plan.height, plan.width)
-        image = _zeros(*plan.shape, channels, *size)
-        alpha = _zeros(*plan.shape, 1, *size)
-        depth = _zeros(*plan.shape, 1, *size)
-        outputs = [_flat(t) for t in (image, alpha, depth)]
-        pool.run([
-            partial(
-                forward, tiles, *plan.tiles, *size, plan.views, splats.tile_starts, splats.entries,
-                plan.shifts, splats.records, arrays[4], _channels(channels), *plan.constants, splats.drawn,
-                splats.reached, *outputs,
-            )
-            for tiles in _tile_runs(splats.tile_starts)
-        ], len(splats.entries))  # fmt: skip
-        ctx.save_for_backward(means, quaternions, scales, opacities, colors, image, alpha, depth)
+        size = (cameras.height, cameras.width)
+        tiles = (-(-cameras.width // layout.TILE), -(-cameras.height // layout.TILE))
+        views = _view_rows(cameras)
+        ctx.parts, each, total = _divide(splits, views.reshape(*cameras.shape, layout.VIEW))
+        ctx.options = (settings.low_pass, settings.antialiased)
+        shape = (len(splits), each)
+        given = (views, ctx.parts, shape, total, tiles, (*ctx.options, near))
+        ctx.splats = _list_splats(arrays, *given, differentiable=any(ctx.needs_input_grad))
+        records, _, _, tile_starts, entries = ctx.splats
+        drawn = np.zeros(len(tile_starts) - 1, np.int64)
+        ctx.reached = np.zeros(len(entries), np.uint8)
+        outputs = [_zeros(*cameras.shape, channels, *size) for channels in (layout.CHANNELS, 1, 1)]
+        # Arguments of both kernels.
+        ctx.tiles = (
+            *tiles, *size, views, tile_starts, entries, records, np.float32(settings.alpha_max), drawn
+        )  # fmt: skip
+        images = [_flat(t) for t in outputs]
+        runs = _tile_runs(tile_starts)
+        pool.run([partial(forward, run, *ctx.tiles, ctx.reached, *images) for run in runs], len(entries))
+        ctx.save_for_backward(means, quaternions, scales, opacities, colors, *outputs)
         ctx.set_materialize_grads(False)
-        ctx.plan = plan
-        ctx.splats = splats
-        return image, alpha, depth
+        return tuple(outputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -299,40 +250,31 @@ class _Rasterize(torch.autograd.Function):
 
         Args:
             ctx: context of autograd.
-            d_image: gradient of the image, [B, T, C, h, w]; None: 0.
+            d_image: gradient of the image, [B, T, 3, h, w]; None: 0.
             d_alpha: gradient of alpha, [B, T, 1, h, w]; None: 0.
             d_depth: gradient of the depth, [B, T, 1, h, w]; None: 0.
 
         Returns:
-            Gradients in the shapes of the inputs, and None for the plan.
+            Gradients in the shapes of the tensors, and None for the other inputs.
         """
         *inputs, image, alpha, depth = ctx.saved_tensors
-        plan = ctx.plan
-        splats = ctx.splats
-        settings = ctx.plan.settings
-        means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
-        gradients = _scratch(len(splats.entries) * layout.gradient_width(colors.shape[1]))
+        records, boxes, entry_starts, tile_starts, entries = ctx.splats
+        gradients = _scratch(len(entries) * layout.GRADIENT)
         d_image = _zeros(*image.shape) if d_image is None else d_image
         images = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
-        pool.run([
-            partial(
-                backward, tiles, *plan.tiles, plan.height, plan.width, plan.views, splats.tile_starts,
-                splats.entries, plan.shifts, splats.records, colors, _channels(colors.shape[1]),
-                *plan.constants, splats.drawn, *images, gradients,
-            )
-            for tiles in _tile_runs(splats.tile_starts)
-        ], len(splats.entries))  # fmt: skip
+        runs = _tile_runs(tile_starts)
+        pool.run([partial(backward, run, *ctx.tiles, *images, gradients) for run in runs], len(entries))
+        means, quaternions, scales = (t.detach().numpy() for t in inputs[:3])
         results = [torch.empty_like(t) for t in inputs]
         d_means, d_quaternions, d_scales, d_opacities, d_colors = (t.numpy() for t in results)
         pool.run([
             partial(
-                collect, means, quaternions, scales, first, last, plan.views[seen_by], plan.shifts[seen_by],
-                settings.low_pass, settings.antialiased, splats.records, splats.boxes, splats.entry_starts,
-                splats.reached, gradients, d_means, d_quaternions, d_scales, d_opacities[:, None], d_colors,
+                collect, means, quaternions, scales, *part[1:], *ctx.options, records, boxes, entry_starts,
+                ctx.reached, gradients, d_means, d_quaternions, d_scales, d_opacities[:, None], d_colors,
             )
-            for _, _, first, last, seen_by in plan.parts
-        ], len(splats.entries) // 2)  # fmt: skip
-        return *results, None
+            for part in ctx.parts
+        ], len(entries) // 2)  # fmt: skip
+        return *results, None, None, None, None
 
 
 _kept = threading.local()
@@ -358,8 +300,3 @@ def _flat(tensor: Tensor | None) -> np.ndarray:
     if tensor is None:
         return np.empty(0, np.float32)
     return tensor.detach().float().contiguous().flatten().numpy()
-
-
-def _channels(count: int):
-    """The number of channels as kernels take it: a tuple of that length is a compile-time constant."""
-    return (0,) * count if count == _COLORS else count

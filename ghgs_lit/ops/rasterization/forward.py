@@ -9,7 +9,7 @@ import numpy as np
 from ghgs_lit.ops import memory, simd
 from ghgs_lit.ops.compile import helper, kernel
 from ghgs_lit.ops.rasterization import layout, tables, tiles
-from ghgs_lit.ops.rasterization.tiles import BLOCKS, LANES, LEAST_ALPHA, ZERO
+from ghgs_lit.ops.rasterization.tiles import BLOCKS, LANES, LEAST_ALPHA, PLANES, ZERO
 
 _DIGIT = 8
 _BUCKETS = 1 << _DIGIT
@@ -117,9 +117,10 @@ def depth_order(entries, start, end, keys, spare, places):
 
 # Entries that are blended into all blocks before the next ones are read: one per bit of an integer.
 _CHUNK = 64
-# Rows of depth and colours in a gathered chunk, after the values of ``tiles.read_splat``.
+# Rows of depth and colour in a gathered chunk, after the values of ``tiles.read_splat``.
 _DEPTH = 7
 _COLOR = 8
+_ROWS = _COLOR + layout.CHANNELS
 
 
 @helper
@@ -151,7 +152,7 @@ def _touches(numbers, slope_x, slope_y, block):
 
 
 @helper
-def _fetch(order, i, entries, shift, records, colors, splats):
+def _fetch(order, i, entries, records, splats):
     """Write the indices of the splats of a chunk, padded with the last one, and prefetch the records of
     the next chunk.
 
@@ -159,28 +160,24 @@ def _fetch(order, i, entries, shift, records, colors, splats):
         order: keys of the tile's entries, from :func:`depth_order`.
         i: first key of the chunk.
         entries: int32 [entries, ENTRY].
-        shift: splat index minus Gaussian index in this view.
         records: [splats, RECORD].
-        colors: [N, C].
         splats: written, int64 [_CHUNK].
     """
     for k in range(_CHUNK):
         splats[k] = entries[order[min(i + k, len(order) - 1)] & 0xFFFFFFFF, layout.SPLAT]
         if i + k + _CHUNK < len(order):
             later = entries[order[i + k + _CHUNK] & 0xFFFFFFFF, layout.SPLAT]
-            tiles.prefetch(records, later, colors, later - shift)
+            memory.prefetch(records, later * layout.RECORD)
 
 
 @helper
-def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo):
+def _list_chunk(splats, count, records, x0, y0, live, rows, todo):
     """Gather splats and find the blocks that each touches.
 
     Args:
         splats: indices of splats, int64 [_CHUNK].
         count: number of splats without padding, at most ``_CHUNK``.
-        shift: splat index minus Gaussian index in this view.
         records: [splats, RECORD].
-        colors: [N, C].
         x0: first column of the tile, in pixels.
         y0: first row of the tile, in pixels.
         live: bit mask of the blocks that are not yet opaque.
@@ -207,12 +204,8 @@ def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo)
             blocks &= blocks - 1
             touching = _touches(numbers, record[layout.SLOPE_X], record[layout.SLOPE_Y], block)
             todo[block] |= (touching & here) << i
-        for c in range(min(colors.shape[1], layout.ROOM)):
+        for c in range(layout.CHANNELS):
             memory.store(rows, (_COLOR + c) * _CHUNK + i, record[layout.COLORS + c])
-    if colors.shape[1] > layout.ROOM:
-        for i in range(count):
-            for c in range(colors.shape[1]):
-                rows[(_COLOR + c) * _CHUNK + i] = colors[splats[i] - shift, c]
 
 
 @helper
@@ -222,19 +215,17 @@ def _add(planes, position, value):
 
 
 @helper
-def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
+def _draw_block(block, todo, rows, pixels, planes, transmittance, alpha_max, hits):
     """Blend splats into a block, front to back.
 
     Args:
         block: index of the block in the tile, 0 to 15.
         todo: bit mask of the chunk's splats to blend.
         rows: numbers of the splats, from :func:`_list_chunk`.
-        count: number of channels C, or a tuple of that length.
         pixels: coordinates of the tile's pixels, from :func:`tiles.grid`.
-        planes: accumulated, sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS].
+        planes: accumulated, sums of the tile (colour, ``w z``, ``w``), [PLANES x PIXELS].
         transmittance: updated, transmittance of the tile, [PIXELS].
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel terminates.
         hits: the block's bit is set for each splat that reaches the block, int32 [_CHUNK].
 
     Returns:
@@ -253,16 +244,16 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
             rows[5 * _CHUNK + i], rows[6 * _CHUNK + i],
         )  # fmt: skip
         p, q = tiles.whiten(numbers, x + numbers[0], y + numbers[1])
-        _, alpha, reached, seen, is_open, behind = tiles.blend(numbers, p, q, before, alpha_max, stop)
+        _, alpha, reached, seen, is_open, behind = tiles.blend(numbers, p, q, before, alpha_max)
         if simd.bits(reached & (before > ZERO)) != 0:
             hits[i] |= bit
         weight = simd.select(seen, before * alpha, ZERO)
-        for c in range(simd.length(count)):
+        for c in range(layout.CHANNELS):
             # Select after the product: 0 times a colour that is not finite would be NaN.
             color = simd.select(seen, weight * rows[(_COLOR + c) * _CHUNK + i], ZERO)
             _add(planes, c * layout.PIXELS + at, color)
-        _add(planes, simd.length(count) * layout.PIXELS + at, weight * rows[_DEPTH * _CHUNK + i])
-        _add(planes, (simd.length(count) + 1) * layout.PIXELS + at, weight)
+        _add(planes, layout.CHANNELS * layout.PIXELS + at, weight * rows[_DEPTH * _CHUNK + i])
+        _add(planes, (layout.CHANNELS + 1) * layout.PIXELS + at, weight)
         before = behind
         if simd.bits(is_open) == 0:
             break
@@ -287,38 +278,37 @@ def _write(image, first, width, rows, columns, block, value):
 
 
 @helper
-def _write_planes(planes, view, first, height, width, rows, columns, channels, image, alpha, depth):
+def _write_planes(planes, view, first, height, width, rows, columns, image, alpha, depth):
     """Write a tile's sums to the images.
 
     Args:
-        planes: sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS].
+        planes: sums of the tile (colour, ``w z``, ``w``), [PLANES x PIXELS].
         view: index of the view.
         first: index of the tile's first pixel in a plane of the image.
         height: image height in pixels.
         width: image width in pixels.
         rows: rows of the tile inside the image.
         columns: columns of the tile inside the image.
-        channels: C.
-        image: written, flat [V C h w].
+        image: written, flat [V 3 h w].
         alpha: written, the sum of ``w``, flat [V h w].
         depth: written, the expected depth: the sum of ``w z`` over the sum of ``w``, flat [V h w].
     """
     for block in range(BLOCKS):
         at = block * LANES
-        for c in range(channels):
-            start = (view * channels + c) * height * width + first
+        for c in range(layout.CHANNELS):
+            start = (view * layout.CHANNELS + c) * height * width + first
             _write(image, start, width, rows, columns, block, memory.load(planes, c * layout.PIXELS + at))
-        total = memory.load(planes, (channels + 1) * layout.PIXELS + at)
+        total = memory.load(planes, (layout.CHANNELS + 1) * layout.PIXELS + at)
         start = view * height * width + first
         _write(alpha, start, width, rows, columns, block, total)
-        expected = memory.load(planes, channels * layout.PIXELS + at) / simd.maximum(total, LEAST_ALPHA)
-        _write(depth, start, width, rows, columns, block, expected)
+        depths = memory.load(planes, layout.CHANNELS * layout.PIXELS + at)
+        _write(depth, start, width, rows, columns, block, depths / simd.maximum(total, LEAST_ALPHA))
 
 
 @kernel
 def forward(
-    some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
-    alpha_max, stop, drawn, reached, image, alpha, depth,
+    some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, records, alpha_max, drawn,
+    reached, image, alpha, depth,
 ):  # fmt: skip
     """Render tiles, and keep the rendered entries for the backward pass (see ``layout``).
 
@@ -331,19 +321,14 @@ def forward(
         views: cameras, float64 [V, VIEW].
         tile_starts: first entry of each tile, int64 [V tiles + 1].
         entries: int32 [entries, ENTRY]; the rendered ones are moved to the front of each tile.
-        shifts: splat index minus Gaussian index in each view, int64 [V].
         records: [splats, RECORD].
-        colors: [N, C].
-        count: number of channels C, or a tuple of that length.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel terminates.
         drawn: written, number of rendered entries of each tile, int64 [V tiles].
         reached: set to 1 at the slots of rendered entries, uint8 [entries].
-        image: written, colours on black, flat [V C h w].
+        image: written, colours on black, flat [V 3 h w].
         alpha: written, flat [V h w].
         depth: written, expected depth, flat [V h w].
     """
-    channels = simd.length(count)
     longest = 1
     for tile in some_tiles:
         longest = max(longest, tile_starts[tile + 1] - tile_starts[tile])
@@ -351,12 +336,12 @@ def forward(
     spare = np.empty(longest, np.int64)
     places = np.empty(256, np.int64)
     kept = np.empty((longest, 3), np.int32)
-    rows = simd.aligned((_COLOR + channels) * _CHUNK)
+    rows = simd.aligned(_ROWS * _CHUNK)
     splats = np.empty(_CHUNK, np.int64)
     todo = np.empty(BLOCKS, np.int64)
     hits = np.empty(_CHUNK, np.int32)
     transmittance = simd.aligned(layout.PIXELS)
-    planes = simd.aligned((channels + 2) * layout.PIXELS)
+    planes = simd.aligned(PLANES * layout.PIXELS)
     pixels = tiles.grid()
     for tile in some_tiles:
         view, x0, y0, height_here, width_here, first = tiles.place(tile, tiles_x, tiles_y, height, width)
@@ -364,16 +349,15 @@ def forward(
         live = tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
         start = tile_starts[tile]
         kept_count = 0
-        shift = shifts[view]
         order = depth_order(entries, start, tile_starts[tile + 1], keys, spare, places)
         for i in range(0, len(order), _CHUNK):
             chunk = min(_CHUNK, len(order) - i)
-            _fetch(order, i, entries, shift, records, colors, splats)
-            _list_chunk(splats, chunk, shift, records, colors, x0, y0, live, rows, todo)
+            _fetch(order, i, entries, records, splats)
+            _list_chunk(splats, chunk, records, x0, y0, live, rows, todo)
             hits[:] = 0
             for block in range(BLOCKS):
                 if todo[block] != 0 and not _draw_block(
-                    block, todo[block], rows, count, pixels, planes, transmittance, alpha_max, stop, hits
+                    block, todo[block], rows, pixels, planes, transmittance, alpha_max, hits
                 ):
                     live &= ~(1 << block)
             for k in range(chunk):
@@ -389,6 +373,4 @@ def forward(
             for k in range(3):
                 entries[start + i, k] = kept[i, k]
         drawn[tile] = kept_count
-        _write_planes(
-            planes, view, first, height, width, height_here, width_here, channels, image, alpha, depth
-        )
+        _write_planes(planes, view, first, height, width, height_here, width_here, image, alpha, depth)

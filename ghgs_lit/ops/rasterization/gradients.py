@@ -21,7 +21,7 @@ _SECOND_MOMENT = geometry.K_SCALE**-4
 
 
 @helper
-def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
+def _gather_splats(m, boxes, entry_starts, reached, gradients, lines):
     """Sum the entries of splats ``m`` to ``m + 8``.
 
     Args:
@@ -29,9 +29,8 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
         boxes: tiles that a splat touches, int32 [splats, 4].
         entry_starts: first slot of each splat, int32 [splats].
         reached: whether an entry was rendered, by slot, uint8 [entries].
-        gradients: gradients of entries, by slot, flat [slots x width].
-        width: number of floats of an entry's gradients, in whole vectors.
-        lines: written, the sums of each rendered splat, [8 width]; lines of other splats are unchanged.
+        gradients: gradients of entries, by slot, flat [slots x GRADIENT].
+        lines: written, the sums of each splat, [8 GRADIENT].
 
     Returns:
         Bit mask of the rendered splats.
@@ -40,17 +39,12 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
     for lane in range(_WIDE):
         s = m + lane
         tiles = (boxes[s, layout.X1] - boxes[s, layout.X0]) * (boxes[s, layout.Y1] - boxes[s, layout.Y0])
-        if tiles == 0:
-            continue
+        total = simd.full(np.float32(0))
         for slot in range(entry_starts[s], entry_starts[s] + tiles):
-            if not reached[slot]:
-                continue
-            for vector in range(0, width, simd.LANES):
-                value = memory.load(gradients, slot * width + vector)
-                if drawn >> lane & 1:
-                    value = memory.load(lines, lane * width + vector) + value
-                memory.store(lines, lane * width + vector, value)
-            drawn |= 1 << lane
+            if reached[slot]:
+                total = total + memory.load(gradients, slot * layout.GRADIENT)
+                drawn |= 1 << lane
+        memory.store(lines, lane * layout.GRADIENT, total)
     return drawn
 
 
@@ -238,13 +232,10 @@ def collect(
         d_quaternions: written, [N, 4].
         d_scales: written, [N, 3].
         d_opacities: written, [N, 1].
-        d_colors: written, [N, C].
+        d_colors: written, [N, 3].
     """
-    channels = d_colors.shape[1]
-    width = layout.kernel_gradient_width(channels)
-    lines = simd.aligned(_WIDE * width)
+    lines = simd.aligned(_WIDE * layout.GRADIENT)
     sums = np.empty(_SUMS * _WIDE)
-    lines[:] = np.float32(0)
     for n in range(first, last, _WIDE):
         mean = tables.columns3(means, n, last)
         scale = tables.columns3(scales, n, last)
@@ -252,24 +243,22 @@ def collect(
         rotation = geometry.rotation(w, x, y, z)
         root = geometry.scale_columns(rotation, scale)
         sums[:] = 0.0
-        for i in range(n, min(n + _WIDE, last)):
-            for c in range(channels):
-                d_colors[i, c] = np.float32(0)
+        d_colors[n : min(n + _WIDE, last)] = np.float32(0)
         for t in range(len(views)):
             m = n + shifts[t]
-            drawn = _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines)
+            drawn = _gather_splats(m, boxes, entry_starts, reached, gradients, lines)
             if drawn == 0:
                 continue
-            moments = tables.load_lines(lines, 0, width)
-            record = tables.load_lines(records, m, layout.RECORD)
+            moments = tables.load_lines(lines, 0)
+            record = tables.load_lines(records, m)
             _splat_gradients(
                 views[t], mean, root, moments, record, simd.mask(drawn), low_pass, antialiased, sums
             )
             while drawn != 0:
                 lane = simd.trailing_zeros(drawn)
                 drawn &= drawn - 1
-                for c in range(channels):
-                    d_colors[n + lane, c] += lines[lane * width + layout.COLOR + c]
+                for c in range(layout.CHANNELS):
+                    d_colors[n + lane, c] += lines[lane * layout.GRADIENT + layout.COLOR + c]
         d = _root_rows(sums)
         r = rotation
         tables.store_columns3(d_scales, n, last, (

@@ -6,16 +6,14 @@ With ``Sigma = L L^T`` its 2D covariance (low-pass included) and ``d`` the vecto
 pixel's centre, the exponent of the Gaussian is ``-(p^2 + q^2) ln 2`` where ``p = K_XX dx`` and
 ``q = K_YX dx + K_YY dy``: a sum of squares, which loses no digits and is never negative."""
 
-from ghgs_lit.ops.compile import helper
-
 RECORD = 16
 # The centre is stored as its pixel and 0.5 minus its fraction (REST), so that small distances from it
 # keep all digits. p^2 + q^2 is smallest along a column of pixels at dy = SLOPE_Y dx, and along a row at
 # dx = SLOPE_X dy.
 COLUMN, ROW, REST_X, REST_Y, K_XX, K_YX, K_YY, OPACITY, CUTOFF, DEPTH, SLOPE_X, SLOPE_Y = range(12)
-# Colours follow, if they have at most ROOM channels.
+# The colour follows.
 COLORS = 12
-ROOM = 4
+CHANNELS = 3
 
 TILE = 16
 BLOCK = 4
@@ -32,8 +30,9 @@ BLOCKS = KEY
 ENTRY = 4
 
 # Gradients of an entry, summed over pixels, with ``h = dL / d ln(alpha)``: moments of h in whitened
-# coordinates, the gradient of the depth and, from COLOR on, the gradients of the colours.
+# coordinates, the gradient of the depth and, from COLOR on, the gradient of the colour.
 H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH, COLOR = range(8)
+GRADIENT = 16
 
 # A view: focal lengths, principal point, rotation, translation, the limits of x/z and y/z, then the
 # last column and row of pixels.
@@ -41,11 +40,11 @@ FX, FY, CX, CY, ROTATION = range(5)
 TRANSLATION = 13
 X_LOW, X_HIGH, Y_LOW, Y_HIGH, RIGHT, BOTTOM, VIEW = range(16, 23)
 
-
-def gradient_width(channels: int) -> int:
-    """Number of floats of an entry's gradients with ``channels`` colours, a multiple of 16."""
-    return -(-(COLOR + channels) // 16) * 16
-
-
-#: :func:`gradient_width` inside kernels.
-kernel_gradient_width = helper(gradient_width)
+# Constants of the image, which are also compiled into gsplat: the smallest rendered alpha, the
+# transmittance at or below which a pixel terminates, the radius in standard deviations beyond which a
+# Gaussian of opacity above one is cut off, and the fraction of tan(field of view / 2) beyond the frame's
+# border at which the Jacobian of centres outside the frame is evaluated.
+ALPHA_MIN = 1 / 255
+STOP = 1e-4
+EXTENT = 3.33
+FRUSTUM_MARGIN = 0.3

@@ -9,6 +9,10 @@ from ghgs_lit.ops.rasterization import geometry, layout, tables
 _WIDE = simd.DOUBLES
 # Splats whose centre is farther away, in pixels, are not rendered: float32 could overflow.
 _FAR = 1e30
+# Largest rendered depth in metres: practically no limit.
+_FARTHEST = 1e10
+# Largest p^2 + q^2 that is rendered.
+_LARGEST = 0.5 * layout.EXTENT * layout.EXTENT * geometry.TO_LOG2
 
 
 @helper
@@ -38,8 +42,7 @@ def _extents(view, u, v, a, c, cutoff):
 
 @helper
 def _project_vector(
-    view, mean, root, opacity, near, far, low_pass, extent, alpha_min, antialiased, m, records,
-    depths, boxes,
+    view, mean, root, opacity, near, low_pass, antialiased, m, records, depths, boxes
 ):  # fmt: skip
     """Project eight Gaussians to splats ``m`` to ``m + 8``.
 
@@ -49,10 +52,7 @@ def _project_vector(
         root: ``R S``, 3 x 3.
         opacity: opacities of the Gaussians.
         near: smallest rendered depth, in metres.
-        far: largest rendered depth, in metres.
         low_pass: added variance in px^2.
-        extent: cut-off radius in standard deviations.
-        alpha_min: smallest rendered alpha.
         antialiased: scale opacity by the determinants.
         m: first splat.
         records: written, [splats, RECORD].
@@ -74,12 +74,12 @@ def _project_vector(
     v = simd.fma(y, view[layout.FY], view[layout.CY])
     if antialiased:
         opacity = opacity * simd.sqrt(simd.minimum(simd.maximum(bare / determinant, 0.0), 1.0))
-    visible = (z >= near) & (z <= far) & (opacity >= alpha_min)
+    visible = (z >= near) & (z <= _FARTHEST) & (opacity >= layout.ALPHA_MIN)
     visible = visible & (determinant > 0.0) & (determinant < np.inf)
     visible = visible & (u > -_FAR) & (u < _FAR) & (v > -_FAR) & (v < _FAR)
     # The largest p^2 + q^2 (a power of 2) at which alpha is at least alpha_min.
-    cutoff = simd.maximum(simd.log2(opacity / alpha_min), 0.0)
-    cutoff = simd.minimum(cutoff, 0.5 * extent * extent * geometry.TO_LOG2)
+    cutoff = simd.maximum(simd.log2(opacity / layout.ALPHA_MIN), 0.0)
+    cutoff = simd.minimum(cutoff, _LARGEST)
     left, right, top, bottom = _extents(view, u, v, a, c, cutoff)
     visible = visible & (left <= right) & (top <= bottom)
     seen = simd.bits(visible)
@@ -108,8 +108,8 @@ def _project_vector(
 
 @kernel
 def project(
-    means, quaternions, scales, opacities, colors, first, last, views, shifts, near, far, low_pass, extent,
-    alpha_min, antialiased, tiles_x, records, depths, boxes, tile_counts,
+    means, quaternions, scales, opacities, colors, first, last, views, shifts, low_pass, antialiased, near,
+    tiles_x, records, depths, boxes, tile_counts,
 ):  # fmt: skip
     """Project Gaussians ``first`` to ``last`` into all ``views``.
 
@@ -118,17 +118,14 @@ def project(
         quaternions: wxyz of any length, [N, 4].
         scales: in metres, [N, 3].
         opacities: [N, 1].
-        colors: [N, C].
+        colors: [N, 3].
         first: first Gaussian of the part.
         last: end of the part, excluded.
         views: cameras of the part's batch element, float64 [T, VIEW].
         shifts: splat index minus Gaussian index in each of these views, int64 [T].
-        near: smallest rendered depth, in metres.
-        far: largest rendered depth, in metres.
         low_pass: added variance in px^2.
-        extent: cut-off radius in standard deviations.
-        alpha_min: smallest rendered alpha.
         antialiased: scale opacities by the determinants.
+        near: smallest rendered depth, in metres.
         tiles_x: number of tiles across a view.
         records: written, [splats, RECORD].
         depths: written, z in metres, [splats, 1].
@@ -145,15 +142,13 @@ def project(
         for t in range(len(views)):
             m = n + shifts[t]
             seen = _project_vector(
-                views[t], mean, root, opacity[0], near, far, low_pass, extent, alpha_min, antialiased, m,
-                records, depths, boxes,
-            )  # fmt: skip
+                views[t], mean, root, opacity[0], near, low_pass, antialiased, m, records, depths, boxes
+            )
             while seen != 0:
                 s = m + simd.trailing_zeros(seen)
                 seen &= seen - 1
-                if colors.shape[1] <= layout.ROOM:
-                    for c in range(colors.shape[1]):
-                        records[s, layout.COLORS + c] = colors[s - shifts[t], c]
+                for c in range(layout.CHANNELS):
+                    records[s, layout.COLORS + c] = colors[s - shifts[t], c]
                 for tile_y in range(boxes[s, layout.Y0], boxes[s, layout.Y1]):
                     for tile_x in range(boxes[s, layout.X0], boxes[s, layout.X1]):
                         tile_counts[t, tile_y * tiles_x + tile_x] += 1

@@ -86,23 +86,19 @@ def _fold(builder, first, second, width):
 
 
 @intrinsic
-def row_sums(typing_context, array, index, count):
-    """Sum each of 16 rows of 16 floats in a fixed order; lane ``k`` is the sum of row ``k``.
+def row_sums(typing_context, array):
+    """Sum each row of 16 floats in a fixed order; lane ``k`` is the sum of row ``k``.
 
     Args:
         typing_context: Numba's.
-        array: flat float32, aligned to a cache line.
-        index: index of the first number.
-        count: number of channels, or a tuple of that length, in which case rows from
-            ``COLOR + len(count)`` on count as 0.
+        array: flat float32, aligned to a cache line; rows from ``COLOR + CHANNELS`` on count as 0.
     """
-    used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
     def emit(context, builder, sig, args):
         rows = []
-        for k in range(min(used, LANES)):
-            position = builder.add(args[1], ir.Constant(args[1].type, k * LANES))
-            address = pointer_to(context, builder, array, args[0], position, index, floats.llvm)
+        for k in range(layout.COLOR + layout.CHANNELS):
+            position = ir.Constant(I64, k * LANES)
+            address = pointer_to(context, builder, array, args[0], position, types.int64, floats.llvm)
             rows.append(builder.load(address, align=64))
         rows += [constant(floats, 0.0)] * (LANES - len(rows))
         width = LANES
@@ -111,7 +107,7 @@ def row_sums(typing_context, array, index, count):
             width //= 2
         return rows[0]
 
-    return floats(array, index, count), emit
+    return floats(array), emit
 
 
 def _flat_rows(context, builder, array_type, args, index_type, count, kind):
@@ -315,23 +311,20 @@ def store_lines(typing_context, array, row, values):
 
 
 @intrinsic
-def load_lines(typing_context, array, row, stride):
-    """Load the first 16 floats of eight rows as 16 vectors of doubles, one per column.
+def load_lines(typing_context, array, row):
+    """Load eight rows of 16 floats as 16 vectors of doubles, one per column.
 
     Args:
         typing_context: Numba's.
         array: float32, flat or a table, aligned to a cache line.
         row: first row.
-        stride: number of floats of a row, a multiple of 16.
     """
 
     def emit(context, builder, sig, args):
-        position = builder.mul(args[1], args[2])
-        lines = []
-        for _ in range(DOUBLES):
-            address = pointer_to(context, builder, array, args[0], position, types.int64, floats.llvm)
-            lines.append(builder.load(address, align=64))
-            position = builder.add(position, args[2])
+        kind = ir.ArrayType(floats.llvm, DOUBLES)
+        address = _flat_rows(context, builder, array, args, types.int64, LANES, kind)
+        places = [builder.gep(address, [ir.Constant(I32, 0), ir.Constant(I32, j)]) for j in range(DOUBLES)]
+        lines = [builder.load(place, align=64) for place in places]
         halves = _transpose(builder, lines)
         values = []
         for k in range(LANES):
@@ -341,4 +334,4 @@ def load_lines(typing_context, array, row, stride):
             values.append(builder.fpext(part, doubles.llvm))
         return context.make_tuple(builder, sig.return_type, values)
 
-    return types.UniTuple(doubles, LANES)(array, types.int64, types.int64), emit
+    return types.UniTuple(doubles, LANES)(array, types.int64), emit

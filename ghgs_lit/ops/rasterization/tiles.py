@@ -1,7 +1,7 @@
 """Rendering of a tile: what the forward and the backward pass share.
 
 A tile is 16 x 16 pixels in 16 blocks of 4 x 4; a block is one vector. Most splats are small (one per
-input pixel) and fit a 4 x 4 block better than a row of 16. The planes of a tile are its colour
+input pixel) and fit a 4 x 4 block better than a row of 16. The planes of a tile are its three colour
 channels, the sum of ``w z`` and the sum of ``w``."""
 
 import numpy as np
@@ -12,8 +12,10 @@ from ghgs_lit.ops.rasterization import layout
 
 LANES = simd.LANES
 BLOCKS = layout.PIXELS // LANES
+PLANES = layout.CHANNELS + 2
 ZERO = np.float32(0)
 ONE = np.float32(1)
+STOP = np.float32(layout.STOP)
 # Smallest denominator of the expected depth; for smaller alphas depth has no gradient in alpha.
 LEAST_ALPHA = np.float32(1e-10)
 
@@ -104,34 +106,6 @@ def read_splat(record, x0, y0):
 
 
 @helper
-def color(records, s, colors, n, c, count):
-    """A channel of a splat's colour.
-
-    Args:
-        records: [splats, RECORD], which hold colours of at most ``layout.ROOM`` channels.
-        s: index of the splat.
-        colors: [N, C].
-        n: index of the splat's Gaussian.
-        c: the channel.
-        count: number of channels C, or a tuple of that length.
-    """
-    if simd.length(count) <= layout.ROOM:
-        return records[s, layout.COLORS + c]
-    return colors[n, c]
-
-
-@helper
-def prefetch(records, s, colors, n):
-    """Prefetch splat ``s`` of Gaussian ``n``, since the splats of a tile are scattered in memory.
-
-    ``records`` is [splats, RECORD], ``colors`` [N, C].
-    """
-    memory.prefetch(records, s * layout.RECORD)
-    if colors.shape[1] > layout.ROOM:
-        memory.prefetch(colors, n * colors.shape[1])
-
-
-@helper
 def whiten(numbers, dx, dy):
     """Whitened coordinates ``p`` and ``q`` of vectors from a splat's centre (see ``layout``).
 
@@ -144,7 +118,7 @@ def whiten(numbers, dx, dy):
 
 
 @helper
-def blend(numbers, p, q, before, alpha_max, stop):
+def blend(numbers, p, q, before, alpha_max):
     """Blend a splat into a block of pixels.
 
     Masked lanes hold zeros, so that whole vectors are stored: a masked store could not be forwarded
@@ -156,12 +130,11 @@ def blend(numbers, p, q, before, alpha_max, stop):
         q: second whitened coordinate of the pixels.
         before: transmittance in front of the splat.
         alpha_max: upper limit of alpha.
-        stop: transmittance at which a pixel terminates.
 
     Returns:
         The unclamped alpha; the clamped alpha; the masks of lanes that the splat reaches, where it is
         visible, and where the pixel is not yet terminated; and the transmittance behind the splat.
-        Where that would fall to ``stop``, the splat is skipped and the transmittance becomes 0, which
+        Where that would fall to ``STOP``, the splat is skipped and the transmittance becomes 0, which
         excludes all splats behind.
     """
     squared = simd.fma(p, p, q * q)
@@ -170,5 +143,5 @@ def blend(numbers, p, q, before, alpha_max, stop):
     raw = numbers[5] * simd.exp2_minus(simd.minimum(squared, numbers[6]))
     alpha = simd.select(reached, simd.minimum(raw, alpha_max), ZERO)
     behind = before - before * alpha
-    is_open = behind > stop
+    is_open = behind > STOP
     return raw, alpha, reached, reached & is_open, is_open, simd.select(is_open, behind, ZERO)
