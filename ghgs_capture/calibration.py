@@ -145,7 +145,7 @@ class StoredCamera:
         both = ((c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other))
         return self.lens == other.lens and all(map(np.array_equal, *both))
 
-    def sized(self, photograph: tuple[int, int]) -> "StoredCamera":
+    def with_size(self, photograph: tuple[int, int]) -> "StoredCamera":
         """Set the camera's size and the intrinsics that depend on it.
 
         Args:
@@ -204,7 +204,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     Raises:
         InputError: the photograph's aspect ratio differs from the calibration's.
     """
-    camera = camera.sized(photograph)
+    camera = camera.with_size(photograph)
     size = camera.size
     if not same_ratio(size, photograph):
         shown = tuple(_SHOWN if side == _CODED else side for side in size)

@@ -14,7 +14,7 @@ import torch
 
 from ghgs_capture.export.page import COARSE, pack, page, unpack
 from ghgs_capture.export.reports import begin_files, end_files, write_file
-from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
+from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, smooth
 from ghgs_lit.files import write_atomically
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
@@ -143,7 +143,7 @@ class Instants:
         def picture(frame: int) -> np.ndarray:
             gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
             # Large frames would show gaps otherwise.
-            gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
+            gaussians = smooth(gaussians, first.pixel).to(seen.extrinsics.device)
             return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
 
         return mp4_bytes(map(picture, range(len(path))), self.options.fps)

@@ -85,12 +85,12 @@ class OutputOptions:
     formats: tuple[str, ...] = ("ply",)  #: keys of :data:`ghgs_capture.export.prediction.FORMATS`
     #: axis (``y``, ``-y``, ``z``) that points up in files; None: files are in the cameras' world
     up: str | None = None
-    smooth: bool = False  #: files contain the :func:`smoothed` Gaussians
+    smooth: bool = False  #: files contain the :func:`smooth` Gaussians
     frames: int = 24  #: images of the turntable
     fps: int = 12  #: images per second of the video
 
 
-def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
+def smooth(gaussians: Gaussians, pixel: float) -> Gaussians:
     """Apply the renderer's image constants to the Gaussians, at the photographs' resolution.
 
     Variances grow by ``low_pass`` square pixels; with ``antialiased`` opacities decrease accordingly
@@ -127,7 +127,7 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     """
     if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
         return gaussians
-    drawn = smoothed(gaussians, pixel)
+    drawn = smooth(gaussians, pixel)
     variances = drawn.scales.square() - VIEWER_LOW_PASS * pixel**2
     scales = variances.clamp(min=(_SMALLEST * pixel) ** 2).sqrt()
     return replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
@@ -182,9 +182,9 @@ class ExportedSubject:
 
     @cached_property
     def stored(self) -> Gaussians:
-        """Gaussians for the PLY, which stores their image constants; :func:`smoothed` with ``smooth``
+        """Gaussians for the PLY, which stores their image constants; :func:`smooth` with ``smooth``
         (as in Mip-Splatting, Yu et al. 2024), so that larger screens show no gaps."""
-        return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
+        return smooth(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:

@@ -87,25 +87,18 @@ class Predict(OfPhotographs, Measured):
     """Instants to use, and how the videos of cameras are synchronised."""
 
 
-class View(Predict):
+class View(Verb):
     """Show a prediction in the browser."""
 
     work = "ghgs_capture.verbs.view.run"
     example = "ghgs view path=runs/predict/..."
-    opens = ()
-    reads_data = False
-    reads_at_once = False
 
     path: PathText | None = None
-    """Directory of ``ghgs predict`` (with its formats ply and inputs), or a PLY; null: predict first."""
-    checkpoint: PathText | None = None
-    """Without path: a checkpoint, as for ``ghgs predict``; null: the weights of this package."""
-    formats: Texts = ("ply", "inputs")
-    """Formats to write, as for ``ghgs predict``."""
-    host: Text = "127.0.0.1"
-    """Address of the server; 127.0.0.1: for this machine only; 0.0.0.0: for the network."""
+    """Directory of ``ghgs predict`` (with its formats ply and inputs), or a PLY."""
+    up: Axis | None = None
+    """Axis that points up; null: estimated from the cameras, y for a PLY."""
     port: int = Field(8080, ge=0, le=65535)
-    """Port of the server; the next free one if it is in use."""
+    """Port of the server on this machine; the next free one if it is in use."""
     seconds: Positive | None = None
     """Time in seconds after which the server stops; null: never."""
 

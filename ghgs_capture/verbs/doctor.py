@@ -38,9 +38,8 @@ def cameras(run: "Doctor") -> None:
     write_config(run, output_dir())
     diagnosis = diagnose(capture_folder(run))
     if not diagnosis.consistent:
-        problems = "; ".join(diagnosis.lines)
-        raise InputError(f"{run.cameras}: expected cameras that fit the masks; found {problems}")
-    print("\n".join(diagnosis.lines), flush=True)
+        raise InputError(f"{run.cameras}: expected cameras that fit the masks; found {diagnosis.line}")
+    print(diagnosis.line, flush=True)
 
 
 def machine(run: "Doctor") -> None:

@@ -69,7 +69,7 @@ def check_cameras(folder: CaptureFolder) -> None:
     Raises:
         InputError: cameras and masks disagree in all of these, or the only instant cannot be read.
     """
-    from ghgs_capture.camera_report import diagnose, find_parted_masks
+    from ghgs_capture.camera_report import diagnose
     from ghgs_capture.rig import spread
 
     several = len(folder.instants) > 1
@@ -82,11 +82,8 @@ def check_cameras(folder: CaptureFolder) -> None:
                 raise
             continue
         diagnoses.append(diagnosis)
-        parts = find_parted_masks(diagnosis.best.views)
-        if len(parts) > 1:
-            print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
         if several and not diagnosis.consistent:
-            print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
+            print(f"instant {name}: cameras and masks do not fit: {diagnosis.line}", flush=True)
     if not diagnoses:
         print("cameras are not checked: none of the instants looked at can be read", flush=True)
         return
@@ -94,6 +91,6 @@ def check_cameras(folder: CaptureFolder) -> None:
     if not best.consistent:
         raise InputError(
             "cameras: expected cameras that fit photographs and masks"
-            f" (check_cameras=false goes on anyway); found {'; '.join(best.lines)}"
+            f" (check_cameras=false goes on anyway); found {best.line}"
         )
-    print("\n".join(best.lines), flush=True)
+    print(best.line, flush=True)

@@ -77,7 +77,7 @@ def test_photographs_become_a_splat_where_the_subject_is(here, predict, capsys, 
     assert messages == ["cameras: entries that are not read: note"]
     assert not list(closed.iterdir())
     out = capsys.readouterr().out
-    assert "calibration.unit=0.001" in out
+    assert "units tall" in out
     assert out.splitlines()[-1] == f"wrote {here / 'splat'}"
     assert (here / "splat" / "depth.npz").exists()
     assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95
