@@ -36,10 +36,10 @@ from torch import Tensor
 from ghgs_capture.agreement import CORRECTION, MISSED, Agreement, doubt_of_masks, reach_of
 from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, UNLIKE, Background, Backgrounds
 from ghgs_capture.capture import Capture
-from ghgs_capture.crops import Photograph, shrunk
+from ghgs_capture.crops import Photograph, shrink
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
-from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
+from ghgs_capture.rig import INSTANTS, Rig, correct_rig, spread
 from ghgs_lit.data.view import area_image
 from ghgs_lit.execution import Predictor
 from ghgs_lit.files import write_text_atomically
@@ -110,17 +110,17 @@ class Measured:
         names = spread(self.folder.instants, BACKGROUND_INSTANTS)
         captures = [Capture(name, self.folder.photographs(name)) for name in names]
         backgrounds = Backgrounds.of(captures)
-        captures = [backgrounds.applied(capture) for capture in spread(captures, INSTANTS)]
-        rig = corrected_rig(captures, self.models["shipped"][0], self.size, "auto", "auto", self.renderer)
+        captures = [backgrounds.apply(capture) for capture in spread(captures, INSTANTS)]
+        rig = correct_rig(captures, self.models["shipped"][0], self.size, "auto", "auto", self.renderer)
         return backgrounds, rig, time.process_time() - begin
 
     def batch(self, masks: str, cameras: str, name: str) -> tuple[Batch, np.ndarray, float]:
         """The batch, intrinsics [v, 3, 3] of the photographs, and CPU seconds of an instant."""
         backgrounds, rig, _ = self.shared
         capture, begin = Capture(name, self.folder.photographs(name)), time.process_time()
-        capture = backgrounds.applied(capture) if masks == "mended" else capture
+        capture = backgrounds.apply(capture) if masks == "mended" else capture
         if cameras == "once" and rig:
-            capture = dataclasses.replace(rig, gains={}).applied(capture)
+            capture = dataclasses.replace(rig, gains={}).apply(capture)
         found = capture.batch(self.size, CORRECTION if doubt_of_masks(capture, self.size) else 0)
         lenses = np.stack([photograph.intrinsics for photograph in capture.photographs])
         return found, lenses, time.process_time() - begin
@@ -128,8 +128,8 @@ class Measured:
     def truth(self, name: str) -> list[dict[str, Any]]:
         """Per camera: the photograph on black and the original, and the verified mask, at half size."""
         backgrounds = self.shared[0]
-        capture = backgrounds.applied(Capture(name, self.folder.photographs(name)))
-        small = tuple(shrunk(p, backgrounds.factors[p.name]) for p in capture.photographs)
+        capture = backgrounds.apply(Capture(name, self.folder.photographs(name)))
+        small = tuple(shrink(p, backgrounds.factors[p.name]) for p in capture.photographs)
         agreement = Agreement.of(Capture(name, small))
         truths = []
         for view, photograph in enumerate(capture.photographs):

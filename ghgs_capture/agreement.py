@@ -84,7 +84,7 @@ class Agreement:
         depths, cells, steps = [], [], []
         for photograph, distance in zip(photographs, distances, strict=True):
             steps.append(max(int(side / _POINTS * photograph.intrinsics[0, 0] / distance), 1))
-            depth, cell = _looked_up(photograph, grid, middle, steps[-1])
+            depth, cell = _look_up(photograph, grid, middle, steps[-1])
             depths.append(depth)
             cells.append(cell)
         return cls(photographs, np.stack(depths), np.stack(cells), tuple(steps))
@@ -159,7 +159,7 @@ def _middle(photographs: tuple[Photograph, ...]) -> Float[np.ndarray, " 3"]:
     return meeting_point(*lines).numpy()
 
 
-def _looked_up(
+def _look_up(
     photograph: Photograph, grid: np.ndarray, middle: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance in pixels [n] float32 and cell index [n] of grid points [n, 3] around ``middle``."""

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from ghgs_capture.agreement import MISSED, Agreement, reach_of
 from ghgs_capture.capture import Capture
-from ghgs_capture.crops import Photograph, shrunk
+from ghgs_capture.crops import Photograph, shrink
 from ghgs_capture.minimum_cut import NEIGHBOURS, minimum_cut, neighbour_pairs
 from ghgs_lit.runtime.cores import allowed_cores
 
@@ -100,7 +100,7 @@ class Background:
         odds = _log_histogram(np.concatenate(subject)) - _log_histogram(image[known])
         return cls(image, known, odds.clip(-_FROM_COLORS, _FROM_COLORS))
 
-    def mended(
+    def mend(
         self, photograph: Photograph, inside: np.ndarray | None = None, most: np.ndarray | None = None
     ) -> Photograph:
         """Segment a photograph again.
@@ -128,7 +128,7 @@ class Background:
             evidence -= np.where(most[box] < -reach, _OUT_OF_TWO, 0)
         costs = self._costs(photograph, box)
         cut = minimum_cut(evidence, costs)
-        changed = self._changed(photograph, cut, box, hull)
+        changed = self._change_matte(photograph, cut, box, hull)
         if changed is None:
             return photograph
         matte = photograph.matte.copy()
@@ -169,7 +169,7 @@ class Background:
             costs.append(_TOGETHER * (_AT_EDGE + (1 - _AT_EDGE) * alike) / np.hypot(*step))
         return costs
 
-    def _changed(
+    def _change_matte(
         self, photograph: Photograph, cut: np.ndarray, box: tuple[slice, slice], hull: np.ndarray | None
     ) -> np.ndarray | None:
         """The matte [h, w] uint8 of a box with the large changes of the mask ``cut``; None without any."""
@@ -265,7 +265,7 @@ class Backgrounds:
             agreement = Agreement.of(capture)
             for view, photograph in enumerate(capture.photographs):
                 photographs.setdefault(photograph.name, []).append(photograph)
-                covered.setdefault(photograph.name, []).append(_covered(photograph, view, agreement))
+                covered.setdefault(photograph.name, []).append(_find_covered(photograph, view, agreement))
                 if agreement is None or not agreement.failed[view]:
                     trusted.setdefault(photograph.name, []).append(photograph)
         cameras = {}
@@ -275,7 +275,7 @@ class Backgrounds:
                 cameras[name] = Background.of(of_camera, covered[name], trusted.get(name, of_camera))
         return cls(cameras, factors)
 
-    def applied(self, capture: Capture) -> Capture:
+    def apply(self, capture: Capture) -> Capture:
         """Correct the masks that fail, if all masks agree better afterwards.
 
         Args:
@@ -290,7 +290,7 @@ class Backgrounds:
         given = small = self._small(capture)
         agreement = Agreement.of(small)
         for _ in range(_ROUNDS if agreement else 1):
-            mended = self._mended(small, agreement)
+            mended = self._mend(small, agreement)
             if all(a is b for a, b in zip(mended.photographs, small.photographs, strict=True)):
                 break
             after = Agreement.of(mended)
@@ -298,31 +298,31 @@ class Backgrounds:
                 break
             small = mended
             agreement = after
-        photographs = map(self._taken_over, capture.photographs, given.photographs, small.photographs)
+        photographs = map(self._take_over, capture.photographs, given.photographs, small.photographs)
         return replace(capture, photographs=tuple(photographs))
 
     def _small(self, capture: Capture) -> Capture:
-        photographs = (shrunk(photo, self.factors.get(photo.name, 1)) for photo in capture.photographs)
+        photographs = (shrink(photo, self.factors.get(photo.name, 1)) for photo in capture.photographs)
         return replace(capture, photographs=tuple(photographs))
 
-    def _mended(self, capture: Capture, agreement: Agreement | None) -> Capture:
+    def _mend(self, capture: Capture, agreement: Agreement | None) -> Capture:
         """Correct the failed masks of an instant once."""
 
-        def mended(view: int) -> Photograph:
+        def mend(view: int) -> Photograph:
             photograph = capture.photographs[view]
             background = self.cameras.get(photograph.name)
             fits = background is not None and background.known.shape == photograph.mask.shape
             if not fits or (agreement and not agreement.failed[view]):
                 return photograph
             if agreement is None:
-                return background.mended(photograph)
+                return background.mend(photograph)
             hulls = (agreement.depth_in_others(view, spare=spare) for spare in (0, 1))
-            return background.mended(photograph, *hulls)
+            return background.mend(photograph, *hulls)
 
         with ThreadPoolExecutor(allowed_cores()) as pool:
-            return replace(capture, photographs=tuple(pool.map(mended, range(len(capture.photographs)))))
+            return replace(capture, photographs=tuple(pool.map(mend, range(len(capture.photographs)))))
 
-    def _taken_over(self, photograph: Photograph, given: Photograph, mended: Photograph) -> Photograph:
+    def _take_over(self, photograph: Photograph, given: Photograph, mended: Photograph) -> Photograph:
         """Apply the changes of a downsampled mask to its photograph."""
         if mended is given:
             return photograph
@@ -335,7 +335,7 @@ class Backgrounds:
         return replace(photograph, matte=_without_specks(matte))
 
 
-def _covered(photograph: Photograph, view: int, agreement: Agreement | None) -> np.ndarray:
+def _find_covered(photograph: Photograph, view: int, agreement: Agreement | None) -> np.ndarray:
     """Pixels [h, w] that may show the subject, including parts that its mask lacks."""
     reach = reach_of(photograph.mask.shape)
     covered = ndimage.binary_dilation(photograph.mask, iterations=reach)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.data.decoding import check_array, check_extrinsics, check_intrinsics
+from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError, require
 
@@ -20,8 +20,6 @@ EXTRINSICS = ("world_to_camera", "camera_to_world")
 AXES = ("opencv", "opengl")
 INTRINSICS = ("pixels", "normalized", "normalized_principal")
 
-#: Largest gain of a camera's colours relative to the mean of all cameras; the least is its inverse.
-MOST_GAIN = 2.0
 #: Converts between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Video is coded in blocks of 16 pixels, so some programs crop a sensor's 1088 rows to 1080.
@@ -123,7 +121,6 @@ class StoredCamera:
         distortion: 0 to 14 numbers: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
             ``fisheye`` k1 to k4 of Kannala and Brandt's model.
         mask: path of the photograph's mask; None if the file lacks it.
-        gains: [3], of red, green and blue relative to other cameras; None if the file lacks them.
         lens: replaces ``intrinsics`` if they depend on the photograph's size and the file has no
             size.
         unread: keys of the camera in the file that are not read."""
@@ -136,7 +133,6 @@ class StoredCamera:
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     fisheye: bool = False
     mask: Path | None = None
-    gains: np.ndarray | None = None
     lens: PartialIntrinsics | None = None
     unread: tuple[str, ...] = ()
 
@@ -169,12 +165,6 @@ class StoredCamera:
         require(bool(np.isfinite(self.distortion).all()), self.origin, "finite distortion", "NaN or infinity")
         positive = self.size is None or min(self.size) > 0
         require(positive, self.origin, "a width and a height above 0", self.size)
-        if self.gains is not None:
-            gains = check_array(f"{self.origin}: gains", self.gains, [(3,)])
-            fits = bool(((gains >= 1 / MOST_GAIN) & (gains <= MOST_GAIN)).all())
-            expected = f"numbers from {1 / MOST_GAIN:g} to {MOST_GAIN:g}"
-            require(fits, f"{self.origin}: gains", expected, gains.tolist())
-            object.__setattr__(self, "gains", gains)
 
 
 @dataclass(frozen=True)
@@ -185,7 +175,6 @@ class Calibration:
     extrinsics: np.ndarray  #: [4, 4] float64, world to camera, OpenCV axes
     distortion: np.ndarray  #: this and the following attributes: as for :class:`StoredCamera`
     fisheye: bool
-    gains: np.ndarray | None = None
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
@@ -225,7 +214,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
     intrinsics[:2] *= convention.resized
     pose = extrinsics_of(camera.pose, convention)
-    return Calibration(intrinsics, pose, camera.distortion, camera.fisheye, camera.gains)
+    return Calibration(intrinsics, pose, camera.distortion, camera.fisheye)
 
 
 def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
@@ -268,7 +257,7 @@ def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(one[0] * other[1] / one[1] - other[0]) <= _ROUNDING
 
 
-def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
+def quarter_turn(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
     """Rotate a camera together with its photograph by quarter turns.
 
     Args:

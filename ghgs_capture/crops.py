@@ -65,7 +65,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     matte = _cut(photograph.matte, spans)
     # Before resizing, so that the background does not bleed into the rim.
     if refine_masks:
-        image, matte = _refined(photograph.name, image, matte, size, refine_masks)
+        image, matte = _refine(photograph.name, image, matte, size, refine_masks)
     else:
         image = _on_black(image, matte)
     return replace(
@@ -73,7 +73,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     )
 
 
-def shrunk(photograph: Photograph, factor: int) -> Photograph:
+def shrink(photograph: Photograph, factor: int) -> Photograph:
     """Downsample a photograph by averaging blocks of pixels.
 
     Args:
@@ -93,7 +93,7 @@ def shrunk(photograph: Photograph, factor: int) -> Photograph:
     return replace(photograph, image=image, matte=matte, intrinsics=intrinsics)
 
 
-def _refined(
+def _refine(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine the matte of a cut; keeps it, with a warning, if the area would change by more than a factor

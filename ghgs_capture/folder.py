@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ghgs_capture.calibration import Convention, StoredCamera, calibrate, quarter_turned
+from ghgs_capture.calibration import Convention, StoredCamera, calibrate, quarter_turn
 from ghgs_capture.crops import Photograph
 from ghgs_capture.formats import CameraFile, read_cameras
 from ghgs_capture.frames import Source, VideoFrame, find_frames, has_videos
@@ -19,9 +19,9 @@ from ghgs_capture.masks import mask_path, matte_of_background, matte_of_file, se
 from ghgs_capture.photographs import (
     Pixels,
     composed_names,
+    find_image,
     find_instants,
     fits_stored,
-    image_named,
     read_pixels,
 )
 from ghgs_lit.config import nodes
@@ -256,10 +256,10 @@ class CaptureFolder:
             expected = "a lens distortion that leaves some of the subject"
             lens = calibration.distortion
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
-        upright = quarter_turned(calibration, turns, size)
+        upright = quarter_turn(calibration, turns, size)
         image = np.rot90(image, turns)
         matte = np.rot90(matte, turns)
-        return Photograph(name, image, matte, upright.intrinsics, upright.extrinsics, upright.gains)
+        return Photograph(name, image, matte, upright.intrinsics, upright.extrinsics)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
         """Matte [h, w] uint8 of a photograph as shown, from the first available source; raises InputError
@@ -268,7 +268,7 @@ class CaptureFolder:
         if self.masks is not None:
             require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
         elif self.backgrounds is not None:
-            background = image_named(self.backgrounds, name)
+            background = find_image(self.backgrounds, name)
             expected = f"a photograph {name} without the subject"
             require(background is not None, f"{self.backgrounds}", expected, "none")
             return matte_of_background(pixels, background)

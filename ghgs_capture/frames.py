@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 
 from ghgs_capture.calibration import Convention, StoredCamera, calibrate
-from ghgs_capture.masks import fitted
+from ghgs_capture.masks import fit_to_photograph
 from ghgs_capture.photographs import (
     MASK_ENDING,
     Pixels,
     by_camera,
-    camera_named,
-    image_named,
-    images_in,
+    find_camera,
+    find_image,
+    list_images,
     require_all_read,
 )
 from ghgs_capture.videos import SUFFIXES, Reader, Video, read_video
-from ghgs_lit.errors import InputError, require
-from ghgs_lit.parsing import normalize_name, read_rows
+from ghgs_lit.errors import require
+from ghgs_lit.parsing import normalize_name
 from ghgs_lit.runtime.cores import allowed_cores
 
 # Video coding changes black and white by less than this
@@ -38,7 +38,7 @@ class VideoFrame:
 
     video: Reader
     number: int
-    mask: "VideoFrame | Path | None" = None
+    mask: "VideoFrame | None" = None
 
     def __str__(self) -> str:
         return f"{self.video.video.path}, frame {self.number}"
@@ -65,7 +65,7 @@ class VideoFrame:
         """
         grey = self.video.frame(self.number)
         exact = np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
-        return fitted(exact, pixels, self.video.video.path)
+        return fit_to_photograph(exact, pixels, self.video.video.path)
 
 
 Source = Path | VideoFrame  #: Where a photograph comes from
@@ -79,10 +79,10 @@ def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping
         cameras: cameras by name.
         names: cameras of videos with other names.
     """
-    if not folder.is_dir() or images_in(folder):
+    if not folder.is_dir() or list_images(folder):
         return False
-    videos = images_in(folder, SUFFIXES)
-    is_known = any(camera_named(name, cameras, names) in cameras for name in videos)
+    videos = list_images(folder, SUFFIXES)
+    is_known = any(find_camera(name, cameras, names) in cameras for name in videos)
     return is_known or (bool(videos) and not any(path.is_dir() for path in folder.iterdir()))
 
 
@@ -92,22 +92,21 @@ def find_frames(
     cameras: Mapping[str, StoredCamera],
     names: Mapping[str, str],
     convention: Convention,
-    sync: Mapping[str, int] | str | None,
+    sync: Mapping[str, int] | None,
     step: int,
 ) -> dict[str, dict[str, VideoFrame]]:
     """Find the frames of each instant that all videos show; warns if the videos differ in length.
 
     Args:
         folder: folder of videos, each named after its camera.
-        masks: folder of masks, with a video or a folder of numbered images of the same name for each
-            video; None: videos in ``folder`` whose names end with ``_mask``, if any.
+        masks: folder of videos of masks, named like the videos; None: videos in ``folder`` whose names
+            end with ``_mask``, if any.
         cameras: cameras by name.
         names: cameras of videos with other names.
         convention: convention of the cameras' numbers, for checking the sizes of videos.
-        sync: number of frames by which each camera started before the others; or path of a CSV
-            ``camera,frame,seconds``, with which each frame of the first camera is matched with the
-            nearest ones of the others; None: all started together.
-        step: step between the instants that will be read, 1 or more; ignored with a CSV.
+        sync: number of frames by which each camera started before the others; None: all started
+            together.
+        step: step between the instants that will be read, 1 or more.
 
     Returns:
         ``{instant: {camera: frame}}``, instants named after the first camera's frame number.
@@ -115,7 +114,7 @@ def find_frames(
     Raises:
         InputError: videos do not fit the cameras or one another.
     """
-    paths_by_name = images_in(folder, SUFFIXES)
+    paths_by_name = list_images(folder, SUFFIXES)
     require_all_read(folder, paths_by_name, {*cameras, *names}, SUFFIXES)
     paths = by_camera(folder, paths_by_name, cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
@@ -126,11 +125,7 @@ def find_frames(
         expected = f"colours of standard range (ffmpeg -i {video.path.name} -vf {filters} ...)"
         require(not video.hdr, str(video.path), expected, video.hdr)
         calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
-    if isinstance(sync, str):
-        numbers = _by_time(videos, Path(sync).expanduser(), names)
-        step = 1
-    else:
-        numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
+    numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
     frames = {}
     for name, video in videos.items():
         reader = Reader(video, "rgb24", step)
@@ -155,8 +150,7 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
     rates = {name: round(video.rate, 4) for name, video in videos.items() if video.count > 1}
     length = min(video.count for video in videos.values())
     drift = (max(rates.values(), default=1) / min(rates.values(), default=1) - 1) * length
-    expected = "as many frames a second of all, or the path of a CSV with camera,frame,seconds"
-    require(drift < 0.5, "sequence.sync", expected, rates)
+    require(drift < 0.5, "sequence.sync", "as many frames a second of all videos", rates)
     first = next(iter(videos))
     shift = {name: offsets.get(name, 0) - offsets.get(first, 0) for name in videos}
     begin = max(-n for n in shift.values())
@@ -168,68 +162,19 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
     return numbers
 
 
-def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
-    """Frame of each camera that is nearest to each of the first camera's, within half a frame time."""
-    import pandas as pd  # here: slow to import
-
-    columns = {"camera": str, "frame": int, "seconds": float}
-    rows = read_rows(path)
-    try:
-        table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
-        if not np.isfinite(table.seconds).all():
-            raise ValueError("no time")
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
-    cameras = table.camera.map(lambda name: names.get(normalize_name(name), normalize_name(name)))
-    times = {name: timed.sort_values("seconds") for name, timed in table.groupby(cameras)}
-    require(times.keys() == videos.keys(), str(path), f"the times of {', '.join(videos)}", ", ".join(times))
-    first, *others = videos
-    steps = times[first].seconds.diff().dropna()
-    half = float(steps.median()) / 2 if len(steps) else np.inf
-    begin = max(timed.seconds.iloc[0] for timed in times.values()) - half
-    end = min(timed.seconds.iloc[-1] for timed in times.values()) + half
-    shared = times[first][times[first].seconds.between(begin, end)][["seconds", "frame"]]
-    require(len(shared) > 0, str(path), "times that all cameras share", "none")
-    shared = shared.rename(columns={"frame": first})
-    for other in others:
-        timed = times[other][["seconds", "frame"]].rename(columns={"frame": other})
-        shared = pd.merge_asof(shared, timed, on="seconds", direction="nearest", tolerance=half)
-    numbers = {}
-    for entry in shared.drop(columns="seconds").to_dict("records"):
-        # A camera without a frame at this time has NaN.
-        numbers[entry[first]] = {name: int(n) for name, n in entry.items() if n == n}
-    return numbers
-
-
-def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
-    """Masks of a video by frame number, from a video of masks or numbered images; raises InputError if
-    ``masks`` is given and lacks them, or if they are not numbered like the frames."""
+def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame]:
+    """Masks of a video by frame number; raises InputError if ``masks`` is given and lacks them."""
     name = normalize_name(video.path.stem)
     place = folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
     names = (marked,) if os.path.realpath(place) == os.path.realpath(folder) else (name, marked)
-    path = image_named(place, *names, suffixes=SUFFIXES)
-    if path is not None:
-        drawn = read_video(path)
-        reader = Reader(drawn, "gray", step)
-        numbers = drawn.numbers.tolist()
-        # Masks made frame by frame do not count the frames that the camera dropped.
-        known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
-        return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}
-    if masks is None:
+    path = find_image(place, *names, suffixes=SUFFIXES)
+    require(path is not None or masks is None, str(masks), f"a video {name}", "none")
+    if path is None:
         return {}
-    below = next((place / spelled for spelled in names if (place / spelled).is_dir()), None)
-    require(below is not None, str(masks), f"a video {name} or a folder of it", "none")
-    return _numbered(below, video)
-
-
-def _numbered(folder: Path, video: Video) -> dict[int, Path]:
-    """Images by frame number, which programs count from 0 or from 1."""
-    digits = {"".join(filter(str.isdigit, name)): path for name, path in images_in(folder).items()}
-    numbered = {int(number): path for number, path in digits.items() if number}
-    if len(numbered) == len(video.numbers):
-        return dict(zip(video.numbers.tolist(), (numbered[n] for n in sorted(numbered)), strict=True))
-    from_one = video.count in numbered
-    expected = f"masks numbered from 0 to {video.count - 1} or from 1 to {video.count}"
-    require(from_one != (0 in numbered), str(folder), expected, f"{len(numbered)} masks")
-    return {number - from_one: path for number, path in numbered.items()}
+    drawn = read_video(path)
+    reader = Reader(drawn, "gray", step)
+    numbers = drawn.numbers.tolist()
+    # Masks made frame by frame do not count the frames that the camera dropped.
+    known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
+    return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}

@@ -110,7 +110,7 @@ class InstantReader(Reader):
             depth: ignored, since depths are unknown.
         """
         instant, first = self._first[name]
-        stored = _stored(self._folder / f"{instant}.npz")
+        stored = _read_crops(self._folder / f"{instant}.npz")
         camera = (first + position) % len(stored["images"])
         matte = stored["mattes"][camera]
         matrices = (stored[key][camera] for key in ("intrinsics", "extrinsics"))
@@ -124,7 +124,7 @@ class InstantReader(Reader):
 
 
 @functools.lru_cache(maxsize=64)
-def _stored(path: Path) -> dict[str, np.ndarray]:
+def _read_crops(path: Path) -> dict[str, np.ndarray]:
     """Crops of an instant, cached for its further views."""
     with np.load(path) as stored:
         return dict(stored)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ghgs_capture.calibration import same_ratio
-from ghgs_capture.photographs import MASK_ENDING, Pixels, image_named, mask_alike, read_pixels
+from ghgs_capture.photographs import MASK_ENDING, Pixels, find_image, find_similar_mask, read_pixels
 from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import import_optional, require, require_choice
 
@@ -52,11 +52,11 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     # Void is a thin rim; a soft matte has values between the labels and the largest value.
     is_void = (values == most).sum() < labelled.sum() and not ((values >= _LABELS) & (values < most)).any()
     if most < _LABELS or is_void:
-        return fitted(labelled * np.uint8(255), pixels, path)
-    return fitted(np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8), pixels, path)
+        return fit_to_photograph(labelled * np.uint8(255), pixels, path)
+    return fit_to_photograph(np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8), pixels, path)
 
 
-def fitted(matte: np.ndarray, pixels: Pixels, path: Path) -> np.ndarray:
+def fit_to_photograph(matte: np.ndarray, pixels: Pixels, path: Path) -> np.ndarray:
     """Rotate and scale a matte to its photograph.
 
     Args:
@@ -155,4 +155,4 @@ def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
     is_same_folder = os.path.realpath(folder) == os.path.realpath(photograph.parent)
     # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
     names = [marked] if is_same_folder else [photograph.stem, photograph.name, marked]
-    return image_named(folder, *names) or mask_alike(folder, photograph.stem, is_same_folder)
+    return find_image(folder, *names) or find_similar_mask(folder, photograph.stem, is_same_folder)

@@ -92,7 +92,7 @@ def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
     return {normalize_name(str(key)): normalize_name(str(name)) for key, name in (names or {}).items()}
 
 
-def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
+def list_images(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
     """List the photographs of a folder, without masks.
 
     Args:
@@ -124,7 +124,7 @@ def parts_of_name(name: str) -> tuple[str, ...]:
     return tuple(part for part in parts if part not in _KINDS.split())
 
 
-def mask_alike(folder: Path, name: str, is_beside: bool) -> Path | None:
+def find_similar_mask(folder: Path, name: str, is_beside: bool) -> Path | None:
     """Find the only mask in a folder whose name has the same parts (:func:`parts_of_name`).
 
     Args:
@@ -149,7 +149,7 @@ def _by_parts(folder: Path, changed: int) -> dict[tuple[str, ...], list[Path]]:
     return paths
 
 
-def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
+def find_image(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
     """Find an image in a folder by name.
 
     Args:
@@ -215,7 +215,7 @@ def find_instants(
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
     known = {*cameras, *names}
-    photographs = images_in(folder)
+    photographs = list_images(folder)
     require_all_read(folder, photographs, known)
     if photographs:
         if of_cameras := _split_names(photographs, cameras, names):
@@ -224,17 +224,17 @@ def find_instants(
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     places = {
         normalize_name(path.name): path
-        for path in sorted(folder.iterdir(), key=lambda path: counted(path.name))
+        for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }
-    below = {name: images_in(path) for name, path in places.items()}
+    below = {name: list_images(path) for name, path in places.items()}
     for name, paths in below.items():
-        is_camera = camera_named(name, cameras, names) in cameras
+        is_camera = find_camera(name, cameras, names) in cameras
         instants = set().union(*below.values())
         require_all_read(places[name], paths, instants if is_camera else known)
     folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
-    if all(camera_named(name, cameras, names) in cameras for name in folders):
+    if all(find_camera(name, cameras, names) in cameras for name in folders):
         return _by_instant(folder, by_camera(folder, folders, cameras, names))
     least = 2 if len(folders) == 1 else 1
     return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
@@ -252,13 +252,13 @@ def _split_names(
         count = max((n for n in range(1, len(parts) + 1) if parts[:n] in begins), default=0)
         rest = "_".join(parts[count:])
         camera = names.get(begins.get(parts[:count], ""), begins.get(parts[:count], ""))
-        if not count or camera_named(name, cameras, names) in cameras or rest in of_cameras.get(camera, {}):
+        if not count or find_camera(name, cameras, names) in cameras or rest in of_cameras.get(camera, {}):
             return {}
         of_cameras.setdefault(camera, {})[rest] = path
     return of_cameras
 
 
-def counted(name: str) -> list[str | int]:
+def natural_key(name: str) -> list[str | int]:
     """Sort key of names that orders numbers by value: 2 before 10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
@@ -273,7 +273,7 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
         expected = f"photographs named as those of {first}"
         examples = ", ".join(list(by_camera[other])[:3])
         require(bool(shared), f"{folder}: {other}", expected, f"others: {examples}")
-    instants = sorted(set().union(*by_camera.values()), key=counted)
+    instants = sorted(set().union(*by_camera.values()), key=natural_key)
     by_instant = {}
     for instant in instants:
         of_cameras = {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
@@ -292,7 +292,7 @@ def _without_folder(paths: Mapping[str, Path]) -> Mapping[str, Path]:
     return named if len(named) == len(paths) and "" not in named else paths
 
 
-def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
+def find_camera(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
     """Find the camera of a photograph by its name.
 
     Args:
@@ -329,7 +329,7 @@ def by_camera(
         InputError: a name matches no camera, two names match the same camera, or there are fewer than
             ``least`` values.
     """
-    named = {name: camera_named(name, cameras, names) for name in values}
+    named = {name: find_camera(name, cameras, names) for name in values}
     unknown = [name for name, camera in named.items() if camera not in cameras]
     if unknown:
         raise InputError(

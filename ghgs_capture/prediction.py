@@ -103,16 +103,16 @@ def predict(
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     refining = refine_cameras, refine_masks, refine
     keys = model, image_size("size", size), *refining, renderer or Renderer()
-    result = _predicted(capture if tones == "auto" else without_tones(capture, tones), *keys)
+    result = _predict_once(capture if tones == "auto" else without_tones(capture, tones), *keys)
     if tones != "auto":
         return replace(result, tones=dict(tones))
-    tones = own_tones(result.batch, result.gaussians)
+    tones = find_tones(result.batch, result.gaussians)
     if not tones:
         return result
-    return replace(_predicted(without_tones(capture, tones), *keys), tones=tones)
+    return replace(_predict_once(without_tones(capture, tones), *keys), tones=tones)
 
 
-def _predicted(
+def _predict_once(
     capture: Capture,
     model: Predictor,
     size: tuple[int, int],
@@ -255,7 +255,7 @@ def _model(path: Path, changed: int) -> Predictor:
     return Predictor.from_checkpoint(path)
 
 
-def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
+def find_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
     """Find cameras with a different tone curve from the others.
 
     Needs three cameras: with two it is undecidable which one differs.

@@ -3,7 +3,6 @@
 A single instant shows one pose, often with a mask error; several instants constrain the cameras better, and
 cameras that are constant over a sequence do not flicker."""
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,10 +13,8 @@ import numpy as np
 import torch
 
 from ghgs_capture.agreement import CORRECTION, doubt_of_cameras, doubt_of_masks
-from ghgs_capture.calibration import MOST_GAIN, Calibration, calibrate
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
-from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.method.rounds import NoRounds
@@ -27,6 +24,8 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras
 
 INSTANTS = 8  #: Number of instants, spread over a sequence, for correcting its cameras
+#: Largest gain of a camera's colours relative to the mean of all cameras; the least is its inverse.
+MOST_GAIN = 2.0
 #: Median deviation of log gains above which exposures change between instants.
 _CHANGING = 0.05
 
@@ -48,7 +47,7 @@ class Rig:
     #: [3], with a geometric mean of 1
     gains: Mapping[str, np.ndarray] = field(default_factory=dict)
 
-    def applied(self, capture: Capture) -> Capture:
+    def apply(self, capture: Capture) -> Capture:
         """Replace the cameras of a capture by the corrected ones.
 
         Args:
@@ -59,42 +58,13 @@ class Rig:
     def _corrected(self, photograph: Photograph) -> Photograph:
         """Correct one camera; a camera that most instants lack is unchanged."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
-        lens = photograph.intrinsics * self._zoom_of(photograph.name)
+        zoom = self.zoom.get(photograph.name, 1.0)
+        lens = photograph.intrinsics * [zoom, zoom, 1.0]
         gains = self.gains.get(photograph.name, photograph.gains)
         return replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
 
-    def _zoom_of(self, name: str) -> list[float]:
-        return [self.zoom.get(name, 1.0)] * 2 + [1.0]
 
-    def calibrations(
-        self, folder: CaptureFolder, captures: Sequence[Capture]
-    ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
-        """Corrected calibrations for a folder's photographs as stored.
-
-        Args:
-            folder: folder of the captures.
-            captures: captures with uncorrected cameras.
-
-        Returns:
-            By camera, its calibration and the (height, width) of its photographs in pixels.
-        """
-        corrected_cameras = {}
-        photographs = itertools.chain.from_iterable(capture.photographs for capture in captures)
-        for name, photograph in {photograph.name: photograph for photograph in photographs}.items():
-            stored = folder.file.cameras[name]
-            size = stored.size or photograph.mask.shape
-            given = calibrate(stored, folder.convention, size)
-            # The correction does not depend on turning the photograph upright.
-            corrected = self._corrected(photograph)
-            moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
-            lens = given.intrinsics * self._zoom_of(name)
-            pose = given.extrinsics @ moved
-            changed = replace(given, intrinsics=lens, extrinsics=pose, gains=corrected.gains)
-            corrected_cameras[name] = changed, size
-        return corrected_cameras
-
-
-def corrected_rig(
+def correct_rig(
     captures: Sequence[Capture],
     model: Predictor,
     size: tuple[int, int],
@@ -155,11 +125,11 @@ def shared_gains(batch: Batch, model: Predictor) -> np.ndarray | None:
         model: in evaluation mode.
 
     Returns:
-        [V, 3] from ``1 / MOST_GAIN`` to ``MOST_GAIN``; None if exposures change between instants,
-        photographs are already divided by gains, or the model does not use gains.
+        [V, 3] from ``1 / MOST_GAIN`` to ``MOST_GAIN``; None if exposures change between instants, or the
+        model does not use gains.
     """
     rounds = model.model.rounds
-    if isinstance(rounds, NoRounds) or not rounds.options.gains or batch.log_gains is not None:
+    if isinstance(rounds, NoRounds) or not rounds.options.gains:
         return None
     batch = Frame.of(batch).enter(batch)
     each = log_gains(model(batch).gaussians, batch)
@@ -178,7 +148,7 @@ def _names(capture: Capture) -> tuple[str, ...]:
 def _together(batches: Sequence[Batch]) -> Batch:
     """Concatenate batches of one element with the same views."""
     parts = {}
-    for name in ("images", "masks", "alpha", "log_gains"):
+    for name in ("images", "masks", "alpha"):
         if getattr(batches[0], name) is not None:
             parts[name] = torch.cat([getattr(batch, name) for batch in batches])
     intrinsics = torch.cat([batch.cameras.intrinsics for batch in batches])

@@ -1,10 +1,8 @@
-"""Files that cover several instants: a page that plays them, numbered PLYs and a video."""
+"""Files that cover several instants: a page that plays them, and a video."""
 
-import math
-import os
-import shutil
+import zlib
 from collections.abc import Iterable
-from functools import partial
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,54 +10,36 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from ghgs_capture.export.page import COARSE, pack, page, unpack
+from ghgs_capture.export.page import COARSE, pack, page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
-from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, smooth
-from ghgs_lit.files import write_atomically
+from ghgs_capture.export.subject import ExportedSubject, OutputOptions, export_subject, smooth
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
-from ghgs_lit.visualization.turntable import orbit
 
-#: Largest angle, in radians, by which the video's camera swings to each side of the first photograph
-_SWING = math.radians(20)
-_VIDEO_SIDE = 720  #: Least length of the longer side of its frames, in pixels
+_VIDEO_SIDE = 720  #: Least length of the longer side of the video's frames, in pixels
 
 
 class Instants:
-    """Files that cover all instants, next to the folders of the instants.
-
-    For ``html`` ``viewer.html``; for ``ply`` ``sequence/0000.ply`` and so on, which other programs
-    import as a sequence; for ``mp4`` ``instants.mp4``. The cameras of page and video follow the
-    subject's mean, smoothed over a second.
+    """Files that cover all instants, next to the folders of the instants: for ``html`` ``viewer.html``,
+    for ``mp4`` ``instants.mp4``. Their cameras follow the subject's mean.
 
     Args:
-        count: largest number of instants.
         options: formats, upward axis and frames per second.
-        others: names of further files, whose contents must be set in the attribute ``others`` before
-            :meth:`write`.
     """
 
-    def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
-        self.count = count
+    def __init__(self, options: OutputOptions):
         self.options = options
-        self.others: dict[str, bytes] = dict.fromkeys(others, b"")
-        self.folders: list[Path] = []
+        #: names of the files, relative to the directory of all instants
+        self.files: list[str] = []
+        for format, name in (("html", "viewer.html"), ("mp4", "instants.mp4")):
+            if format in options.formats:
+                self.files.append(name)
+        self._folders: list[Path] = []
         self._first: ExportedSubject | None = None
         self._packed: list[bytes] = []
+        self._frames: list[bytes] = []
         self._means: list[np.ndarray] = []
-        self._boxes: list[np.ndarray] = []
-
-    @property
-    def files(self) -> list[str]:
-        """Names of the files that may be written, relative to the directory of all instants."""
-        numbered = [f"sequence/{number:04d}.ply" for number in range(self.count)]
-        names = {"html": ["viewer.html"], "ply": numbered, "mp4": ["instants.mp4"]}
-        made = []
-        for format, files in names.items():
-            if format in self.options.formats:
-                made += files
-        return [*made, *self.others]
 
     def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:
         """Add the next instant.
@@ -68,20 +48,31 @@ class Instants:
             folder: the folder of this instant's own files.
             batch: photographs, masks and cameras of one subject.
             prediction: the prediction for this batch.
-            renderer: renders the frames of the video.
+            renderer: renders the frame of the video.
         """
-        self.folders.append(folder)
-        if not {"html", "mp4"} & {*self.options.formats}:
+        self._folders.append(folder)
+        if not self.files:
             return
-        subject = exported_subject(batch, prediction, renderer, self.options)
-        self._first = self._first or subject
-        self._packed.append(pack(subject.gaussians, self._first.pixel, self._first.center, COARSE))
+        subject = export_subject(batch, prediction, renderer, self.options)
+        self._first = first = self._first or subject
         points = subject.body if len(subject.body) else subject.center[None]
-        self._means.append(points.mean(0).cpu().numpy())
-        self._boxes.append(torch.stack((points.amin(0), points.amax(0))).cpu().numpy())
+        mean = points.mean(0)
+        self._means.append(mean.cpu().numpy())
+        if "viewer.html" in self.files:
+            self._packed.append(pack(subject.gaussians, first.pixel, first.center, COARSE))
+        if "instants.mp4" in self.files:
+            gaussians = smooth(subject.gaussians, first.pixel)  # large frames would show gaps otherwise
+            shift = torch.from_numpy(self._means[0]).to(mean) - mean
+            moved = replace(gaussians, means=gaussians.means + shift)
+            camera = first.cameras[:1]
+            larger = max(_VIDEO_SIDE / max(camera.height, camera.width), 1.0)
+            camera = camera.resize(round(larger * camera.height), round(larger * camera.width))
+            picture = to_uint8(renderer(moved, camera[None]).image[0, 0])
+            self._frames.append(zlib.compress(picture.tobytes(), 1))
+            self._shape = picture.shape
 
     def write(self, directory: Path) -> list[Path]:
-        """Write the files, after all instants have been added and their own files written.
+        """Write the files, after all instants have been added.
 
         Args:
             directory: the directory of all instants.
@@ -92,68 +83,28 @@ class Instants:
         Raises:
             InputError: a file that no earlier prediction wrote has one of the names.
         """
-        self.count = len(self.folders)
-        self.others = {name: made for name, made in self.others.items() if made}
-        names = self.files
-        if not names:
+        if not self.files:
             return []
-        for name in begin_files(directory, names):
-            # Files of an earlier, longer sequence would be played, too.
-            if name.startswith("sequence/"):
-                (directory / name).unlink()
-        contents = {name: partial(self.others.get, name) for name in self.others}
-        contents |= {"viewer.html": self._page, "instants.mp4": self._video}
-        sources = iter(self.folders)
-        for name in names:
-            if name in contents:
-                write_file(directory / name, contents[name])
-            else:
-                write_atomically(directory / name, partial(_link, next(sources) / "gaussians.ply"))
-        return end_files(directory, names, {"instants": [folder.name for folder in self.folders]})
+        begin_files(directory, self.files)
+        contents = {"viewer.html": self._page, "instants.mp4": self._video}
+        for name in self.files:
+            write_file(directory / name, contents[name])
+        return end_files(directory, self.files, {"instants": [folder.name for folder in self._folders]})
 
-    def _path(self) -> np.ndarray:
-        """Translation [instants, 3] of page and video: the smoothed path of the subject's mean."""
+    def _page(self) -> bytes:
+        """The page, whose camera follows the subject's mean, smoothed over a second."""
         reach = self.options.fps // 2
         # Odd reflection at the ends keeps a steady walk steady.
         padded = np.pad(np.stack(self._means), ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
         weights = np.hanning(2 * reach + 3)[1:-1]
         windows = np.lib.stride_tricks.sliding_window_view(padded, len(weights), axis=0)
-        means = windows @ (weights / weights.sum())
-        return means - means[0]
-
-    def _page(self) -> bytes:
-        name = self.folders[0].parent.name
-        path = self._path().tolist()
-        return page(self._first, name, self._packed, path, self.options.fps).encode()
+        path = windows @ (weights / weights.sum())
+        name = self._folders[0].parent.name
+        return page(self._first, name, self._packed, (path - path[0]).tolist(), self.options.fps).encode()
 
     def _video(self) -> bytes:
-        """Render the video, in which the camera swings by ``_SWING`` to each side once over all instants."""
-        first = self._first
-        cameras = self._first.cameras
-        path = self._path()
-        low, high = (np.stack(self._boxes) - path[:, None]).swapaxes(0, 1)
-        sides = torch.from_numpy(np.stack((low.min(0), high.max(0)), 1)).to(cameras.extrinsics.device)
-        turns = torch.arange(len(path), dtype=torch.float64) * (2 * math.pi / len(path))
-        seen = orbit(cameras, _SWING * turns.sin(), torch.cartesian_prod(*sides))
-        shifts = torch.from_numpy(path).to(seen.extrinsics)
-        seen.extrinsics[:, :3, 3] -= (seen.extrinsics[:, :3, :3] @ shifts[..., None])[..., 0]
-        larger = max(_VIDEO_SIDE / max(seen.height, seen.width), 1.0)
-        seen = seen.resize(round(larger * seen.height), round(larger * seen.width))
-
-        def picture(frame: int) -> np.ndarray:
-            gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
-            # Large frames would show gaps otherwise.
-            gaussians = smooth(gaussians, first.pixel).to(seen.extrinsics.device)
-            return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
-
-        return mp4_bytes(map(picture, range(len(path))), self.options.fps)
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+        pictures = (np.frombuffer(zlib.decompress(frame), np.uint8) for frame in self._frames)
+        return mp4_bytes((picture.reshape(self._shape) for picture in pictures), self.options.fps)
 
 
 # Players guess the colour matrix and range otherwise.

@@ -6,7 +6,6 @@ import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
@@ -61,43 +60,6 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
     planes = wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes()
     packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
     return packer.compress(planes) + packer.flush()
-
-
-def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians) -> Gaussians:
-    """Restore the Gaussians of :func:`pack`, on the CPU.
-
-    Args:
-        data: the packed bytes.
-        pixel: as for :func:`pack`.
-        center: as for :func:`pack`.
-        steps: as for :func:`pack`.
-        like: Gaussians whose image constants (``low_pass``, ``antialiased``) are copied.
-
-    Returns:
-        The Gaussians of one subject, rounded to ``steps``, in float32.
-    """
-    planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
-    wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
-    centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
-    narrow = planes[4 * _WIDE :].T.astype(np.int64).cumsum(0)
-    narrow[:, [3, 5]] += narrow[:, [4]]
-    scales, colors, rotations = (torch.from_numpy(part) for part in np.split(narrow, [3, 7], axis=1))
-    turned = _signed(rotations) / steps["rotation"]
-    square = turned.square().sum(1, keepdim=True)
-    values = {
-        "means": center.cpu() + centers * (pixel / steps["center"]),
-        "scales": pixel * (_signed(scales) / steps["scale"]).exp(),
-        "quaternions": torch.cat([1 - square, 2 * turned], dim=1) / (1 + square),
-        "colors": (colors[:, :3] & 255) / 255,
-        "opacities": (colors[:, 3] & 255) / steps["opacity"],
-    }
-    values = {name: value.float() for name, value in values.items()}
-    return replace(like, **values, image=None, pixel=None, splits=(len(centers),))
-
-
-def _signed(numbers: Tensor) -> Tensor:
-    """Map numbers modulo 256 to the range from -128 to 127."""
-    return (numbers + 128 & 255) - 128
 
 
 def page(

@@ -15,7 +15,7 @@ from PIL import Image
 from ghgs_capture.export.instants import mp4_bytes
 from ghgs_capture.export.page import page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
-from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
+from ghgs_capture.export.subject import ExportedSubject, OutputOptions, export_subject, file_names
 from ghgs_capture.formats.matrices import camera_entry, cameras_json
 from ghgs_lit.errors import InputError, import_optional, require, require_choice
 from ghgs_lit.geometry.frame import HEIGHT
@@ -37,7 +37,7 @@ SHEET = "sheet.png"  #: Overview of inputs, renderings and depth
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
 
 
-def half_turned(gaussians: Gaussians) -> Gaussians:
+def half_turn(gaussians: Gaussians) -> Gaussians:
     """Rotate Gaussians by 180 degrees about x, between the axes of a PLY (right, down, front) and of SPZ
     (right, up, back).
 
@@ -54,7 +54,7 @@ def half_turned(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, means=means, quaternions=quaternions)
 
 
-def converted(name: str, gaussians: Gaussians) -> bytes:
+def convert(name: str, gaussians: Gaussians) -> bytes:
     """Convert Gaussians to another program's format with the package gaussforge.
 
     Args:
@@ -70,7 +70,7 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
     from gaussforge import GaussForge  # here: optional dependency
 
     if name == "spz":
-        gaussians = half_turned(gaussians)
+        gaussians = half_turn(gaussians)
     answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
     if answer.get("error"):
         expected = "formats: expected Gaussians that gaussforge converts to"
@@ -89,20 +89,6 @@ def png(picture: np.ndarray) -> bytes:
     """
     content = BytesIO()
     Image.fromarray(picture).save(content, format="PNG")
-    return content.getvalue()
-
-
-def depth_file(subject: ExportedSubject) -> bytes:
-    """Encode depth maps and cameras as NPZ.
-
-    Returns:
-        The content of a file with ``depth`` [V, H, W] float32 (NaN where unknown), ``intrinsics``,
-        ``extrinsics`` and ``views``.
-    """
-    depth = torch.where(subject.depth_valid, subject.depth.float(), torch.nan).cpu().numpy()
-    cameras = {name: getattr(subject.cameras, name).cpu().numpy() for name in ("intrinsics", "extrinsics")}
-    content = BytesIO()
-    np.savez_compressed(content, depth=depth, **cameras, views=np.array(subject.views))
     return content.getvalue()
 
 
@@ -164,7 +150,7 @@ def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubj
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
     **{
-        name: Format((f"gaussians.{suffix}",), _of_viewers(partial(converted, name)), "gaussforge")
+        name: Format((f"gaussians.{suffix}",), _of_viewers(partial(convert, name)), "gaussforge")
         for name, suffix in CONVERTED.items()
     },
     "html": Format(("viewer.html",), _one(lambda s: page(s, s.name).encode())),
@@ -175,7 +161,6 @@ FORMATS: dict[str, Format] = {
         "imageio_ffmpeg",
         "video",
     ),
-    "depth": Format(("depth.npz",), _one(depth_file)),
     "inputs": Format(("inputs/{view}.png", "cameras.json"), input_files),
 }
 
@@ -239,7 +224,7 @@ def write_prediction(
     Raises:
         InputError: there are several subjects, or a file that no prediction wrote would be replaced.
     """
-    subject = exported_subject(batch, prediction, renderer, options)
+    subject = export_subject(batch, prediction, renderer, options)
     names = output_files(options, subject.views)
     begin_files(directory, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:

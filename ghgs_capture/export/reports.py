@@ -26,30 +26,28 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
         InputError: a file would be replaced; the message names the first one.
     """
     read = {os.path.realpath(path) for path in inputs}
-    written = _written_before(directory)
+    written = _list_written(directory)
     for name in (*names, REPORT):
         path = directory / name
         expected = "another folder (out=...) than that of an input"
         require(os.path.realpath(path) not in read, str(path), expected, "the input")
+        is_ours = name in written or (name == REPORT and written)
         expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
-        require(name in written or not path.exists(), str(path), expected, "another file")
+        require(is_ours or not path.exists(), str(path), expected, "another file")
 
 
-def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
+def begin_files(directory: Path, names: Sequence[str]) -> None:
     """List files in the report before they are written, so that it covers those of an interrupted run.
 
     Args:
         directory: where files will be written.
         names: names of the files, relative to the directory.
 
-    Returns:
-        Names of other files of earlier predictions.
-
     Raises:
         InputError: a file that no earlier prediction wrote has one of the names.
     """
     require_free(directory, names)
-    return _write_report(directory, dict.fromkeys(names), {})
+    _write_report(directory, dict.fromkeys(names), {})
 
 
 def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) -> list[Path]:
@@ -79,22 +77,19 @@ def write_file(path: Path, content: Callable[[], bytes]) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(made))
 
 
-def _write_report(directory: Path, files: Mapping[str, int | None], report: Mapping[str, Any]) -> list[str]:
-    """Write the report, which also lists other files of earlier predictions, and return their names."""
-    written = _written_before(directory)
-    earlier = [name for name in written if name not in (REPORT, *files) and (directory / name).exists()]
-    kept = {"earlier_files": earlier} if earlier else {}
-    text = json.dumps(to_json_data({**report, "files": files, **kept}), indent=1, allow_nan=False)
+def _write_report(directory: Path, files: Mapping[str, int | None], report: Mapping[str, Any]) -> None:
+    """Write the report, which also lists other files of earlier predictions."""
+    written = _list_written(directory)
+    kept = {name: size for name, size in written.items() if (directory / name).exists()}
+    text = json.dumps(to_json_data({**report, "files": {**kept, **files}}), indent=1, allow_nan=False)
     write_text_atomically(directory / REPORT, text)
-    return earlier
 
 
-def _written_before(directory: Path) -> list[str]:
-    """Names of the files that the report of a directory lists; empty without a report."""
+def _list_written(directory: Path) -> dict[str, int | None]:
+    """Files that the report of a directory lists, with their sizes; empty without a report."""
     try:
         report = read_json(directory / REPORT)
     except InputError:
-        return []
-    if not isinstance(report, dict) or not isinstance(report.get("files"), dict):
-        return []
-    return [REPORT, *report["files"], *report.get("earlier_files", ())]
+        return {}
+    files = report.get("files") if isinstance(report, dict) else None
+    return files if isinstance(files, dict) else {}

@@ -133,7 +133,7 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     return replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
 
 
-def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
+def fit(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
     """Optimise Gaussians in ``_FIT_STEPS`` steps so that their renderings match those of others.
 
     Args:
@@ -174,8 +174,6 @@ class ExportedSubject:
     images: Float[Tensor, "V 3 H W"]
     masks: Bool[Tensor, "V H W"]
     mattes: Float[Tensor, "V H W"]
-    depth: Float[Tensor, "V H W"]
-    depth_valid: Bool[Tensor, "V H W"]
     up: Float[Tensor, "3"]
     renderer: Renderer
     options: OutputOptions
@@ -196,7 +194,7 @@ class ExportedSubject:
         if converted is self.gaussians or not len(converted):
             return converted
         around = turntable(self.cameras, _AROUND, self.body)
-        return fitted(converted, self.gaussians, (self.cameras, around), self.renderer)
+        return fit(converted, self.gaussians, (self.cameras, around), self.renderer)
 
     @cached_property
     def body(self) -> Float[Tensor, "n 3"]:
@@ -221,7 +219,7 @@ class ExportedSubject:
         return [to_uint8(self.renderer(self.gaussians, cameras).image[0, 0]) for cameras in seen]
 
 
-def exported_subject(
+def export_subject(
     batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
 ) -> ExportedSubject:
     """Convert the prediction for a batch of one subject to the frame of the files (``options.up``).
@@ -253,9 +251,6 @@ def exported_subject(
         end = up.new_tensor(AXES[options.up])
         gaussians, cameras = rotate_world(turn(up, end), gaussians, cameras)
         up = end
-    depth = prediction.depth[0].detach()
-    valid = prediction.depth_valid[0] & batch.masks[0]
-    valid = valid & depth.isfinite() & (depth > 0)
     return ExportedSubject(
         name=batch.subjects[0] if batch.subjects else "subject",
         views=batch.views[0] if batch.views else tuple(map(str, range(batch.images.shape[1]))),
@@ -265,8 +260,6 @@ def exported_subject(
         images=batch.images[0],
         masks=batch.masks[0],
         mattes=coverage(batch)[0],
-        depth=depth,
-        depth_valid=valid,
         up=up,
         renderer=renderer,
         options=options,

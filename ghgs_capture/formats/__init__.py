@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ghgs_capture.formats.colmap import find_model, read_colmap
 from ghgs_capture.formats.entries import CameraFile
-from ghgs_capture.formats.matrices import EASYMOCAP, QUALISYS, list_yaml, read_mapping, read_matrices
+from ghgs_capture.formats.matrices import EASYMOCAP, list_yaml, read_mapping, read_matrices
 from ghgs_capture.formats.nerfstudio import read_nerfstudio
 from ghgs_lit.errors import InputError, require, require_choice
 from ghgs_lit.parsing import find_path
@@ -20,9 +20,8 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "opencv": read_matrices,
     "easymocap": read_matrices,
     "toml": read_matrices,
-    "qualisys": read_matrices,
 }
-_SINGLE = (".json", ".toml", QUALISYS)  # Suffixes of formats with a single file
+_SINGLE = (".json", ".toml")  # Suffixes of formats with a single file
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
@@ -30,7 +29,7 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
 
     Args:
         path: a file, or a folder that contains transforms.json, a COLMAP model, EasyMocap's files,
-            OpenCV's YAML files, one per camera, or a single JSON, TOML or .qca.txt.
+            OpenCV's YAML files, one per camera, or a single JSON or TOML.
         format: one of :data:`FORMATS`; ``auto``: detected from file names and keys of JSON.
 
     Returns:
@@ -50,7 +49,7 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
             return FORMATS[name](file)
     raise InputError(
         f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap,"
-        " TOML, or Qualisys' .qca.txt; found"
+        " or TOML; found"
         f" {'a folder without any' if path.is_dir() else repr(path.suffix)}"
     )
 
@@ -74,8 +73,8 @@ def _candidates(path: Path) -> Iterator[tuple[str, Path]]:
         for file in files:
             yield from _candidates(file)
     elif name.endswith(".json"):
-        yield "nerfstudio" if "frames" in read_mapping(path)[0] else "ghgs", path
-    elif name.endswith((".yml", ".yaml", ".toml", QUALISYS)):
+        yield "nerfstudio" if "frames" in read_mapping(path) else "ghgs", path
+    elif name.endswith((".yml", ".yaml", ".toml")):
         yield "opencv", path
     elif name.endswith((".bin", ".txt")) and find_model(path.parent) is not None:
         yield "colmap", path

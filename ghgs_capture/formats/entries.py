@@ -28,7 +28,6 @@ NAMES = {
     "height": ("height", "imageheight", "h"),
     "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
     "model": ("cameramodel", "distortionmodel", "lensmodel", "projection", "projectionmodel"),
-    "gains": ("gains",),
 }
 #: Names of distortion coefficients: of OpenCV's perspective and fisheye models
 PERSPECTIVE = "k1 k2 p1 p2 k3 k4 k5 k6"

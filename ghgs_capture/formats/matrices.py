@@ -1,14 +1,13 @@
-"""Read cameras stored as named matrices: this package's JSON, and OpenCV's as YAML, JSON, TOML or XML.
+"""Read cameras stored as named matrices: this package's JSON, and OpenCV's as YAML, JSON or TOML.
 
 YAML of ``cv2.FileStorage`` has a file for each camera, one file for all, or EasyMocap's two files. TOML is
-written by Pose2Sim, Anipose and Caliscope; XML is Qualisys' ``.qca.txt``. Files differ in spelling:
+written by Pose2Sim, Anipose and Caliscope. Files differ in spelling:
 ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. OpenCV's poses map
 the world to the camera; pixel centres are at integers."""
 
 import json
 import re
 import tomllib
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,17 +15,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ghgs_capture.calibration import Calibration, Convention, StoredCamera
-from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, CameraFile, Entries, pinhole
+from ghgs_capture.calibration import Convention, StoredCamera
+from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, CameraFile, Entries
 from ghgs_lit.errors import require
 from ghgs_lit.parsing import check_yaml, find_path, read_parsed
 
 EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
-QUALISYS = ".qca.txt"
 _VECTORS = (3,), (3, 1), (1, 3)
-_SUBPIXELS = 64  # Qualisys stores 64ths of pixels
-_LENS = {"k1": "radialDistortion1", "k2": "radialDistortion2", "p1": "tangentalDistortion1"}
-_LENS |= {"p2": "tangentalDistortion2", "k3": "radialDistortion3"}
 
 
 class _Loader(yaml.SafeLoader):
@@ -69,62 +64,28 @@ def _parse_json(text: str) -> Any:
     return json.loads(text, object_pairs_hook=_require_unique_keys)
 
 
-def _parse_qualisys(text: str) -> dict[str, Any]:
-    """Parse Qualisys' XML (camera-to-world poses) to cameras by serial number, with OpenCV's keys."""
-    cameras = {}
-    try:
-        for camera in ElementTree.fromstring(text).iter("camera"):
-            numbers = {}
-            for part in ("fov_video", "transform", "intrinsic"):
-                numbers |= {key: float(value) for key, value in camera.find(part).attrib.items()}
-            fx, fy, cx, cy = (
-                numbers.pop(key) / _SUBPIXELS
-                for key in ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-            )
-            left, top, right, bottom = (numbers.pop(key) for key in ("left", "top", "right", "bottom"))
-            rotation = np.array([[numbers.pop(f"r{row}{column}") for column in "123"] for row in "123"])
-            center = [numbers.pop(axis) for axis in "xyz"]
-            lens = {name: numbers.pop(key, 0.0) for name, key in _LENS.items()}
-            cameras[camera.attrib["serial"]] = {
-                "K": pinhole(fx, fy, cx - left, cy - top),
-                "R": rotation,
-                "T": -rotation @ center,
-                "D": list(lens.values()) if any(lens.values()) else None,
-                "size": [right - left + 1, bottom - top + 1],
-                **numbers,
-            }
-    except (ElementTree.ParseError, AttributeError) as error:
-        raise ValueError(repr(error)) from error
-    return cameras
-
-
-#: By suffix: the parser, a description for messages, and the convention of the numbers
+#: By suffix: the parser, and a description for messages
 _KINDS = {
-    ".json": (_parse_json, "JSON", Convention(pixel_centers="integer")),
-    ".toml": (tomllib.loads, "TOML", Convention(pixel_centers="integer")),
-    QUALISYS: (
-        _parse_qualisys,
-        "cameras of Qualisys",
-        Convention(axes="opengl", pixel_centers="integer", unit=0.001),
-    ),
-    "": (_parse_yaml, "YAML of OpenCV", Convention(pixel_centers="integer")),
+    ".json": (_parse_json, "JSON"),
+    ".toml": (tomllib.loads, "TOML"),
+    "": (_parse_yaml, "YAML of OpenCV"),
 }
 
 
-def read_mapping(path: Path) -> tuple[dict[str, Any], Convention]:
-    """Parse a file of JSON, TOML, Qualisys' XML or else YAML.
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Parse a file of JSON, TOML or else YAML.
 
     Returns:
-        The mapping in the file, and the convention of OpenCV's matrices in it.
+        The mapping in the file.
 
     Raises:
         InputError: the file cannot be read or parsed, is not a mapping, or is JSON with a duplicate key.
     """
     kind = next(ending for ending in _KINDS if path.name.lower().endswith(ending))
-    parse, expected, convention = _KINDS[kind]
+    parse, expected = _KINDS[kind]
     content = read_parsed(path, expected, parse)
     require(isinstance(content, dict), str(path), f"{expected} with named entries", type(content).__name__)
-    return content, convention
+    return content
 
 
 def list_yaml(folder: Path) -> list[Path]:
@@ -136,8 +97,8 @@ def read_matrices(path: Path) -> CameraFile:
     """Read cameras from a file, from all YAML files of a folder, or from EasyMocap's two files.
 
     This package's JSON is ``{"cameras": {<name>: {...}}}``, or only the inner mapping, with ``intrinsics``
-    [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``, ``fisheye`` and
-    ``gains`` in the conventions of :mod:`ghgs_lit.types`; only the first two are required. Other cameras
+    [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion`` and
+    ``fisheye`` in the conventions of :mod:`ghgs_lit.types`; only the first two are required. Other cameras
     have OpenCV's ``K``, ``R``, ``T``, ``D``.
 
     Args:
@@ -151,12 +112,13 @@ def read_matrices(path: Path) -> CameraFile:
     """
     cameras: list[StoredCamera] = []
     unread: list[str] = []
-    for file, content, convention in _read_contents(path):
+    convention = Convention(pixel_centers="integer")
+    for file, content in _read_contents(path):
         named = _list_cameras(file, content)
         own = {}
         if file.suffix.lower() == ".json":
             own = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
-        convention = Convention() if own else convention
+            convention = Convention() if own else convention
         read = own or {name: camera for name, camera in named.items() if _has_intrinsics(camera)}
         others = {name: camera for name, camera in named.items() if name not in read}
         if not read:
@@ -169,21 +131,20 @@ def read_matrices(path: Path) -> CameraFile:
     return CameraFile.of(cameras, convention, unread)
 
 
-def _read_contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Convention]]:
-    """Yield each file with its mapping and convention; EasyMocap's two files are merged."""
+def _read_contents(path: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Yield each file with its mapping; EasyMocap's two files are merged."""
     folder = path if path.is_dir() else path.parent
     is_pair = find_path(folder, EASYMOCAP[0]) is not None if path.is_dir() else path.name.lower() in EASYMOCAP
     if not is_pair:
         for file in list_yaml(path) if path.is_dir() else [path]:
-            yield file, *read_mapping(file)
+            yield file, read_mapping(file)
         return
     fields: dict[str, Any] = {}
     for name in EASYMOCAP:
         file = find_path(folder, name)
         require(file is not None, str(folder / name), "EasyMocap's file beside the other", "no such file")
-        content, convention = read_mapping(file)
-        fields |= content
-    yield folder, fields, convention
+        fields |= read_mapping(file)
+    yield folder, fields
 
 
 def _list_cameras(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,7 +211,6 @@ def read_camera(name: str, entries: Entries) -> StoredCamera:
         size=entries.size,
         distortion=entries.distortion(FISHEYE if fisheye else PERSPECTIVE),
         fisheye=fisheye,
-        gains=entries.array("gains", (3,)),
         unread=entries.unread(),
     )
 
@@ -280,21 +240,3 @@ def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dic
 def cameras_json(entries: Mapping[str, dict[str, Any]]) -> str:
     """Serialise entries of :func:`camera_entry`, by name, as this package's JSON."""
     return json.dumps({"cameras": entries}, indent=1)
-
-
-def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
-    """Serialise cameras as JSON that :func:`read_matrices` reads.
-
-    Args:
-        cameras: by name, each with the (height, width) of its photographs in pixels.
-
-    Returns:
-        The content of a file.
-    """
-    entries = {}
-    for name, (camera, size) in cameras.items():
-        entries[name] = camera_entry(camera.intrinsics, camera.extrinsics, size)
-        entries[name] |= {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
-        if camera.gains is not None:
-            entries[name]["gains"] = camera.gains.tolist()
-    return cameras_json(entries) + "\n"

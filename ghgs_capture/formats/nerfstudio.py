@@ -32,7 +32,7 @@ def read_nerfstudio(path: Path) -> CameraFile:
     Raises:
         InputError: there are no frames, or a frame is invalid.
     """
-    content, _ = read_mapping(path)
+    content = read_mapping(path)
     frames = content.get("frames")
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
     cameras = [_read_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]

@@ -23,7 +23,7 @@ class OfPhotographs(Verb):
     """Folder of photographs or videos named after their cameras, or of one such folder for each instant."""
     cameras: PathText | None = None
     """Calibration, a file or folder: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of
-    Pose2Sim, .qca.txt of Qualisys."""
+    Pose2Sim."""
     masks: PathText | None = None
     """Folder of masks. null: the first available source of backgrounds, segment, <name>_mask.png, masks
     that the calibration names, alpha."""
@@ -74,8 +74,8 @@ class Predict(OfPhotographs, Measured):
     """Without images: name of the subject, or its index in the split."""
     split: Literal["train", "val"] = "val"
     """Without images: split of the subject."""
-    formats: Texts = ("ply", "html", "turntable", "depth", "inputs")
-    """Formats to write: ply, html, turntable, depth, inputs; with the extra "formats" compressed_ply, spz,
+    formats: Texts = ("ply", "html", "turntable", "inputs")
+    """Formats to write: ply, html, turntable, inputs; with the extra "formats" compressed_ply, spz,
     sog; with the extra "video" mp4; or all."""
     up: Axis | None = None
     """Axis that points up in all files, such as -y for SuperSplat; null: the world of the cameras."""

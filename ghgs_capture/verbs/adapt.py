@@ -11,7 +11,7 @@ from ghgs_capture.prediction import without_tones
 from ghgs_capture.rig import spread
 from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.photographs import capture_folder
-from ghgs_capture.verbs.predict import captures_of, mended_by, shared_by
+from ghgs_capture.verbs.predict import estimate_shared, mend_masks, read_captures
 from ghgs_lit.cli.inputs import (
     build_data,
     build_renderer,
@@ -109,16 +109,16 @@ def prepare_instants(run: Adapt) -> None:
     model = load_predictor(run.plain, run.checkpoint, device)
     size = run.data.size
     refining = dict.fromkeys(("refine_cameras", "refine_masks", "tones"), "auto")
-    tones, backgrounds, rig, _ = shared_by(folder, model, size, refining, build_renderer(run, device))
+    tones, backgrounds, rig = estimate_shared(folder, model, size, refining, build_renderer(run, device))
     names = spread(folder.instants, _INSTANTS)
     used = []
-    for given in captures_of(folder, names):
+    for given in read_captures(folder, names):
         if {photograph.name for photograph in given.photographs} != set(run.data.cameras):
             print(f"instant {given.name} is not learned from: its cameras are not those of the first")
             continue
-        capture = without_tones(mended_by(backgrounds, given), tones)
+        capture = without_tones(mend_masks(backgrounds, given), tones)
         if agrees(capture):
-            write_instant(rig.applied(capture) if rig else capture, root, size)
+            write_instant(rig.apply(capture) if rig else capture, root, size)
             used.append(given.name)
     print(f"{len(used)} of {len(names)} instants have masks that agree, and are learned from", flush=True)
     write_text_atomically(root / LISTING, json.dumps(splits_of(used)))

@@ -15,9 +15,8 @@ from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
 from ghgs_capture.capture import Capture
 from ghgs_capture.export.reports import REPORT
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.formats.matrices import json_text
 from ghgs_capture.prediction import CapturePrediction, crop_size, predict, predict_batch, without_tones
-from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
+from ghgs_capture.rig import INSTANTS, Rig, correct_rig, spread
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
@@ -91,7 +90,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
     """
     folder = capture_folder(run)
     output = export.output_options(run)
-    directories, together = _free_places(folder, output, directory, bool(run.refine_cameras))
+    directories, together = _free_places(folder, output, directory)
     if run.check_cameras:
         check_cameras(folder)
     device = inputs.pick_device(run.device)
@@ -109,13 +108,13 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
     rig = None
     backgrounds = Backgrounds({})
     if together:
-        shared = shared_by(folder, model, size, refining, renderer)
-        refining["tones"], backgrounds, rig, together.others["rig.json"] = shared
+        shared = estimate_shared(folder, model, size, refining, renderer)
+        refining["tones"], backgrounds, rig = shared
         refining["refine_cameras"] = 0
     begin = time.perf_counter()
-    for given in captures_of(folder):
-        capture = mended_by(backgrounds, given)
-        capture = rig.applied(capture) if rig else capture
+    for given in read_captures(folder):
+        capture = mend_masks(backgrounds, given)
+        capture = rig.apply(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer)
         place = directories[capture.name]
         write_result(place, result, renderer, run.checkpoint, output)
@@ -158,17 +157,15 @@ def _moved_line(moved: Mapping[str, float]) -> str:
 
 
 def _free_places(
-    folder: CaptureFolder, output: export.OutputOptions, directory: Path, moves_cameras: bool
+    folder: CaptureFolder, output: export.OutputOptions, directory: Path
 ) -> tuple[dict[str, Path], export.Instants | None]:
     """Directory of each instant by name, and the files that cover several instants (None for one).
 
-    ``moves_cameras`` adds a file of corrected cameras to the latter. Raises InputError if writing would
-    replace an input or a file that no prediction wrote."""
+    Raises InputError if writing would replace an input or a file that no prediction wrote."""
     several = len(folder.instants) > 1
     read = folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
-    others = ["rig.json"] if moves_cameras else []
-    together = export.Instants(len(directories), output, others) if several else None
+    together = export.Instants(output) if several else None
     for name, path in directories.items():
         export.require_free(path, export.output_files(output, list(folder.paths[name])), read)
     if together:
@@ -176,13 +173,13 @@ def _free_places(
     return directories, together
 
 
-def shared_by(
+def estimate_shared(
     folder: CaptureFolder,
     model: Predictor,
     size: tuple[int, int],
     refining: Mapping[str, Any],
     renderer: Renderer,
-) -> tuple[Mapping[str, float], Backgrounds, Rig | None, bytes]:
+) -> tuple[Mapping[str, float], Backgrounds, Rig | None]:
     """Estimate tone curves, static backgrounds and corrected cameras of a sequence from some instants.
 
     Args:
@@ -194,8 +191,8 @@ def shared_by(
         renderer: renders the comparisons of the refinement.
 
     Returns:
-        Gammas by camera (from the first instant), backgrounds, corrected cameras, and the content of
-        their file; the last two are None and empty if the cameras remain unchanged.
+        Gammas by camera (from the first instant), backgrounds, and corrected cameras (None if they
+        remain unchanged).
     """
     begin = time.perf_counter()
     names = folder.instants
@@ -213,24 +210,23 @@ def shared_by(
         tones = predict(captures[0], model, size, **plain).tones if captures else {}
     backgrounds = Backgrounds.of(captures if masks else [])
     captures = spread(captures, INSTANTS)
-    mended = [without_tones(backgrounds.applied(capture), tones) for capture in captures]
-    rig = corrected_rig(mended, model, size, rounds, masks, renderer) if captures and rounds else None
-    if rig is None:
-        return tones, backgrounds, None, b""
-    why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
-    took = time.perf_counter() - begin
-    print(f"{_moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
-    return tones, backgrounds, rig, json_text(rig.calibrations(folder, captures)).encode()
+    mended = [without_tones(backgrounds.apply(capture), tones) for capture in captures]
+    rig = correct_rig(mended, model, size, rounds, masks, renderer) if captures and rounds else None
+    if rig is not None:
+        why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
+        took = time.perf_counter() - begin
+        print(f"{_moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
+    return tones, backgrounds, rig
 
 
-def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
+def mend_masks(backgrounds: Backgrounds, given: Capture) -> Capture:
     """Correct masks by static backgrounds and print which ones changed.
 
     Args:
         backgrounds: without any, nothing changes.
         given: an instant.
     """
-    capture = backgrounds.applied(given)
+    capture = backgrounds.apply(given)
     both = zip(given.photographs, capture.photographs, strict=True)
     if mended := [after.name for before, after in both if after is not before]:
         line = f"instant {given.name}: the background mends masks of {', '.join(mended)}"
@@ -238,7 +234,7 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
     return capture
 
 
-def captures_of(folder: CaptureFolder, names: Sequence[str] | None = None) -> Iterator[Capture]:
+def read_captures(folder: CaptureFolder, names: Sequence[str] | None = None) -> Iterator[Capture]:
     """Read instants of a folder one by one, decoding the next one in the background.
 
     If there are several, those that cannot be read are left out with a message.

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, PathText, Positive, Share, Text, Words
+from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Text, Words
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -16,9 +16,7 @@ class Calibration(Options):
     """Corrections of values that the camera file omits or states wrongly; null: as defined by its format."""
 
     group = "calibration"
-    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml", "qualisys"] = (
-        "auto"
-    )
+    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml"] = "auto"
     """Format of the camera file."""
     extrinsics: Literal["world_to_camera", "camera_to_world"] | None = None
     """Transformation that the matrices describe."""
@@ -48,10 +46,9 @@ class SequenceOptions(Options):
     """Number after the last instant (exclusive); negative: counted from the end."""
     step: Count = 1
     """Use every step-th instant."""
-    sync: PathText | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
+    sync: Annotated[dict, Words("a mapping of cameras to frames")] | None = None
     """Synchronization of videos. null: equal frame numbers are simultaneous. {camera: frames}: number of
-    frames by which the camera began before the others. A CSV file (camera,frame,seconds): frames nearest
-    in time to those of the first camera."""
+    frames by which the camera began before the others."""
 
 
 class Turntable(Options):

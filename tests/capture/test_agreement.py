@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from ghgs_capture.agreement import MISSED, Agreement
 from ghgs_capture.backgrounds import Backgrounds
 from ghgs_capture.capture import Capture
-from ghgs_capture.crops import Photograph, shrunk
+from ghgs_capture.crops import Photograph, shrink
 from tests.helpers.figures import Figure
 
 COUNT = 8
@@ -105,15 +105,15 @@ def test_masks_that_fail_are_mended_and_the_others_stay(monkeypatch):
         instants.append((right, capture(of, str(number), number, masks, 6 * number - 20)))
     backgrounds = Backgrounds.of([instant for _, instant in instants])
     rounds = []
-    mend = Backgrounds._mended
+    mend = Backgrounds._mend
 
     def spy(self, capture, agreement):
         rounds.append((capture.photographs, agreement.photographs))
         return mend(self, capture, agreement)
 
-    monkeypatch.setattr(Backgrounds, "_mended", spy)
+    monkeypatch.setattr(Backgrounds, "_mend", spy)
     for number, (right, instant) in enumerate(instants):
-        mended = backgrounds.applied(instant)
+        mended = backgrounds.apply(instant)
         wrong = {2} if number >= COUNT // 2 else set()
         wrong |= {0} if number == COUNT - 1 else set()
         for view, (before, after) in enumerate(zip(instant.photographs, mended.photographs, strict=True)):
@@ -127,7 +127,7 @@ def test_masks_that_fail_are_mended_and_the_others_stay(monkeypatch):
 
 def test_a_smaller_photograph_has_its_camera():
     photograph = capture(figure()).photographs[0]
-    small = shrunk(photograph, 3)
+    small = shrink(photograph, 3)
     assert small.image.shape == (85, 64, 3)
     means = photograph.image[:255].reshape(85, 3, 64, 3, 3).mean((1, 3))
     assert np.abs(small.image - means).max() < 1

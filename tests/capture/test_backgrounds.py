@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from ghgs_capture.backgrounds import Backgrounds
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
-from ghgs_capture.verbs.predict import mended_by
+from ghgs_capture.verbs.predict import mend_masks
 
 SIDE, COUNT = 200, 8
 ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE]
@@ -47,7 +47,7 @@ def instant(number, mask=None, image=None, step=10, shirt=SHIRT, background=None
 
 
 def mended(capture, captures):
-    (photograph,) = Backgrounds.of(captures).applied(capture).photographs
+    (photograph,) = Backgrounds.of(captures).apply(capture).photographs
     return photograph
 
 
@@ -72,8 +72,8 @@ def test_an_object_taken_for_the_subject_is_removed():
 def test_a_part_that_is_left_out_comes_back_and_is_said(capsys):
     captures, (head, body) = whole(), parts(3)
     captures[3] = instant(3, body)
-    mended_by(Backgrounds.of(captures), captures[2])
-    found = mended_by(Backgrounds.of(captures), captures[3]).photographs[0].mask
+    mend_masks(Backgrounds.of(captures), captures[2])
+    found = mend_masks(Backgrounds.of(captures), captures[3]).photographs[0].mask
     line = "instant 3: the background mends masks of left (refine_masks=0 leaves them)\n"
     assert capsys.readouterr().out == line
     assert found[head].mean() > 0.95
@@ -109,7 +109,7 @@ def test_masks_that_are_right_are_not_touched(name):
     captures = [instant(n, **options, **(third if n == 3 else {})) for n in range(COUNT)]
     found = Backgrounds.of(captures)
     for capture in captures if not third else captures[3:4]:
-        assert found.applied(capture).photographs[0] is capture.photographs[0]
+        assert found.apply(capture).photographs[0] is capture.photographs[0]
 
 
 def test_what_never_moves_has_no_background():

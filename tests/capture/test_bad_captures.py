@@ -223,17 +223,6 @@ BAD = {
         "cam1: expected a lens distortion that leaves some of the subject",
         "1000000.0",
     ),
-    **{
-        f"gains {gains}": (lambda p, gains=gains: camera(p, gains=gains), f"cam1: gains: {line}", "found")
-        for gains, line in (
-            ((1.0, 1.0), "expected an array 3"),
-            (0.9, "expected an array 3"),
-            ((1.0, 1.0, "red"), "expected an array 3"),
-            ((1.0, 1.0, float("nan")), "expected finite numbers"),
-            ((1.0, 0.0, 1.0), "expected numbers from 0.5 to 2"),
-            ((1.0, 2.1, 1.0), "expected numbers from 0.5 to 2"),
-        )
-    },
     "two instants": (lambda p: folders(p, "a", "b"), "calibration.names", "found a"),
 }
 

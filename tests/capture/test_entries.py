@@ -215,10 +215,6 @@ REFUSED = {
         lambda p: write(p / "extri.yml", "a: 1"),
         r"intri\.yml: expected EasyMocap's file beside the other; found 'no such file'",
     ),
-    "Qualisys": (
-        lambda p: write(p / "c.qca.txt", '<a><camera serial="1"><fov_video/></camera></a>'),
-        r"c\.qca\.txt: expected cameras of Qualisys; found",
-    ),
 }
 
 

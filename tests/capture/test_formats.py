@@ -13,10 +13,10 @@ from ghgs_capture.calibration import (
     Convention,
     calibrate,
     extrinsics_of,
-    quarter_turned,
+    quarter_turn,
 )
 from ghgs_capture.formats import FORMATS, read_cameras
-from ghgs_capture.formats.matrices import json_text
+from ghgs_capture.formats.matrices import camera_entry, cameras_json
 from ghgs_lit.config import nodes
 from ghgs_lit.errors import InputError
 from tests.helpers.calibrations import CAMERA, frame, one_camera, transforms, write
@@ -79,33 +79,12 @@ def all_in_one_file(path):
 
 def own_json(path):
     read = read_cameras(ANIPOSE)
-    calibrations = {n: (calibrate(c, read.convention, SIZE), SIZE) for n, c in read.cameras.items()}
-    return write(path / "cameras.json", json_text(calibrations))
-
-
-QUALISYS = """<camera serial="{name}"><fov_video left="{left}" top="{top}" right="{right}" bottom="{bottom}"/>
-<transform x="{x}" y="{y}" z="{z}" {turn}/>
-<intrinsic focalLengthU="{fx}" focalLengthV="{fy}" centerPointU="{cx}" centerPointV="{cy}"
- radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"
- tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/></camera>"""
-
-
-def qualisys(path):
-    """Qualisys' file: millimetres, 1/64 pixels, y up and z backward, a part of the sensor."""
-    cameras = ""
-    left, top = 16, 8
-    for name, camera in rig().items():
-        eye = -1000 * camera["R"].T @ camera["T"]
-        turn = np.diag([1, -1, -1]) @ camera["R"]
-        lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera["D"], strict=True))
-        k = 64 * camera["K"]
-        cameras += QUALISYS.format(
-            name=name, left=left, top=top, right=left + SIZE[1] - 1, bottom=top + SIZE[0] - 1,
-            turn=" ".join(f'r{i + 1}{j + 1}="{turn[i, j]}"' for i in range(3) for j in range(3)),
-            **dict(zip("xyz", eye, strict=True)), **lens,
-            fx=k[0, 0], fy=k[1, 1], cx=k[0, 2] + 64 * left, cy=k[1, 2] + 64 * top,
-        )  # fmt: skip
-    return write(path / "Calib.qca.txt", f"<calibration><cameras>{cameras}</cameras></calibration>")
+    entries = {}
+    for name, stored in read.cameras.items():
+        camera = calibrate(stored, read.convention, SIZE)
+        entries[name] = camera_entry(camera.intrinsics, camera.extrinsics, SIZE)
+        entries[name] |= {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
+    return write(path / "cameras.json", cameras_json(entries))
 
 
 WRITERS = {
@@ -114,7 +93,6 @@ WRITERS = {
     "opencv, JSON": lambda path: write(path / "cameras.json", lists()),
     "anipose and pose2sim": lambda path: ANIPOSE,
     "own": own_json,
-    "qualisys": qualisys,
 }
 
 
@@ -263,7 +241,7 @@ def test_a_turned_photograph_turns_its_camera(turns):
         spot = np.zeros(SIZE, bool)
         spot[row, column] = True
         [[turned_row, turned_column]] = np.argwhere(np.rot90(spot, turns))
-        pixel = projected(quarter_turned(straight, turns, SIZE), point[None])[0]
+        pixel = projected(quarter_turn(straight, turns, SIZE), point[None])[0]
         assert np.abs(pixel - [turned_column + 0.5, turned_row + 0.5]).max() <= 0.5 + 1e-9
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 from ghgs_capture import camera_report
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.verbs.photographs import check_cameras
-from ghgs_capture.verbs.predict import captures_of
+from ghgs_capture.verbs.predict import read_captures
 from ghgs_lit.errors import InputError
 from tests.helpers.captures import truncate
 from tests.helpers.sequences import (
@@ -46,7 +46,7 @@ def test_a_single_instant_of_a_sequence_is_refused_as_one(place):
     truncate(folder / "002" / "cam1.png")
     one = CaptureFolder(folder, place / "cameras.json", sequence={"start": 2, "stop": 3})
     with pytest.raises(InputError, match=r"cam1\.png: expected a readable image"):
-        list(captures_of(one))
+        list(read_captures(one))
 
 
 def test_a_photograph_missing_in_a_folder_of_cameras(place):
@@ -88,7 +88,6 @@ REFUSED = {
     "nothing before the start": ({"start": 3, "stop": 2}, "from 3 to 2"),
     "no step": ({"step": 0}, r"sequence\.step: expected an integer >= 1; found 0"),
     "no such key": ({"skip": 1}, "sequence key: expected one of .*found 'skip'"),
-    "no such file": ({"sync": "nowhere.csv"}, r"nowhere\.csv: expected"),
 }
 
 

@@ -129,7 +129,7 @@ def test_weights_learn_from_instants_and_an_interrupted_run_goes_on(tmp_path, mo
     assert "3 of 3 instants have masks that agree, and are learned from" in capsys.readouterr().out
     assert not out.exists()
     monkeypatch.undo()
-    monkeypatch.setattr(adapt, "shared_by", None)
+    monkeypatch.setattr(adapt, "estimate_shared", None)
     assert ghgs(*command) == 0
     printed = capsys.readouterr().out
     assert "4 photographs of instants that were not learned from, each from the other cameras: " in printed

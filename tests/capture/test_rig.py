@@ -1,70 +1,21 @@
 """Cameras and colour gains shared by several instants: estimation, and the file with the results."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from ghgs_capture import rig as rig_module
 from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.formats.matrices import json_text
 from ghgs_capture.prediction import predict
-from ghgs_capture.rig import Rig, corrected_rig, shared_gains
+from ghgs_capture.rig import Rig, correct_rig, shared_gains
 from ghgs_lit.execution import Predictor
 from ghgs_lit.rendering import Renderer
 from tests.helpers.figures import Figure
 
 NAMES = [f"cam{v}" for v in range(4)]
-
-
-def some_rig(figure):
-    """A rig with cameras that differ from the figure's: rotated, shifted and zoomed."""
-    extrinsics, turn = {}, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    for number, name in enumerate(NAMES):
-        pose = np.array(figure.cameras[name]["extrinsics"])
-        angle = 0.01 * (number + 1)
-        small = np.cos(angle) * np.eye(3) + np.sin(angle) * turn
-        small[2, 2] = 1
-        pose[:3, :3] = pose[:3, :3] @ small
-        pose[:3, 3] += [0.01, -0.02, 0.03 * number]
-        extrinsics[name] = pose
-    return Rig(extrinsics, {name: 1 + 0.01 * n for n, name in enumerate(NAMES)}, dict.fromkeys(NAMES, 1.0))
-
-
-def same(one, other):
-    for first, second in zip(one.photographs, other.photographs, strict=True):
-        np.testing.assert_allclose(first.intrinsics, second.intrinsics, atol=1e-9)
-        np.testing.assert_allclose(first.extrinsics, second.extrinsics, atol=1e-9)
-
-
-@pytest.mark.parametrize("orientation", [1, 6])
-def test_the_file_of_a_rig_gives_the_corrected_cameras(tmp_path, orientation):
-    """Also for photographs that are rotated upright, with lens distortion."""
-    figure = Figure()
-    cameras = {
-        name: {**camera, "distortion": [0.05, -0.01, 0.0, 0.0]} for name, camera in figure.cameras.items()
-    }
-    path = figure.write(tmp_path / "images", cameras=cameras)
-    turns = {1: 0, 6: 3}[orientation]
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    for name, image in zip(figure.names, figure.images, strict=True):
-        stored = np.ascontiguousarray(np.rot90(image, -turns))
-        Image.fromarray(stored).save(tmp_path / "images" / f"{name}.png", exif=exif)
-    folder = CaptureFolder(tmp_path / "images", path)
-    given = Capture(folder.instants[0], folder.photographs(folder.instants[0]))
-    rig = some_rig(figure)
-    (tmp_path / "rig.json").write_text(json_text(rig.calibrations(folder, [given])))
-    read = Capture.read(tmp_path / "images", tmp_path / "rig.json")
-    same(read, rig.applied(given))
-    assert np.abs(read.photographs[1].extrinsics - given.photographs[1].extrinsics).max() > 0.01
-    for one, other in zip(given.photographs, read.photographs, strict=True):
-        # Another focal length bends a little otherwise.
-        assert np.abs(one.image.astype(int) - other.image).mean() < 2
 
 
 def captures(tmp_path, count=4):
@@ -108,7 +59,7 @@ def test_auto_corrects_where_half_of_the_instants_contradict(
     monkeypatch.setattr(
         rig_module, "doubt_of_cameras", lambda capture, batch: "they miss" * (int(capture.name) < doubted)
     )
-    rig = corrected_rig(captures(tmp_path), model, (56, 56), "auto", 0, Renderer())
+    rig = correct_rig(captures(tmp_path), model, (56, 56), "auto", 0, Renderer())
     assert (rig is not None) == corrected == bool(asked.batches)
     if rig:
         assert rig.why == "in 2 of 4 instants they miss"
@@ -120,27 +71,22 @@ def test_auto_corrects_where_half_of_the_instants_contradict(
 def test_an_instant_that_lacks_a_camera_takes_no_part(tmp_path, asked, model):
     three, *whole = captures(tmp_path)
     three = Capture("three", three.photographs[:3])
-    rig = corrected_rig([three, *whole], model, (56, 56), 3, 0, Renderer())
+    rig = correct_rig([three, *whole], model, (56, 56), 3, 0, Renderer())
     assert asked.batches[0].subjects == ("1", "2", "3")
     assert asked.rounds == 3
     assert list(rig.extrinsics) == NAMES
     given = whole[0].photographs[0].extrinsics
-    moved = rig.applied(three).photographs[0].extrinsics - given
+    moved = rig.apply(three).photographs[0].extrinsics - given
     assert moved[0, 3] == pytest.approx(0.01)
 
 
 def test_a_camera_that_most_instants_lack_stays_as_it_is(tmp_path, asked, model):
-    """It is also in the file of the rig, since the next capture may contain it."""
     whole = captures(tmp_path)
     three = [Capture(c.name, c.photographs[:3]) for c in whole[:3]]
-    rig = corrected_rig([*three, whole[3]], model, (56, 56), 3, 0, Renderer())
+    rig = correct_rig([*three, whole[3]], model, (56, 56), 3, 0, Renderer())
     assert list(rig.extrinsics) == NAMES[:3]
-    last = rig.applied(whole[3]).photographs[3]
+    last = rig.apply(whole[3]).photographs[3]
     np.testing.assert_array_equal(last.extrinsics, whole[3].photographs[3].extrinsics)
-    folder = CaptureFolder(tmp_path, tmp_path / "cameras.json")
-    found = rig.calibrations(folder, [*three, whole[3]])
-    assert list(found) == NAMES
-    np.testing.assert_allclose(found["cam3"][0].extrinsics, last.extrinsics, atol=1e-12)
 
 
 #: Two cameras 15 % off, one a little blue; the product over the cameras is 1.
@@ -156,22 +102,19 @@ def seen_with(path, gains, seed=0):
     return figure.write(path)
 
 
-def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, asked, model, monkeypatch):
+def test_gains_are_found_once_and_used(tmp_path, asked, model, monkeypatch):
     """One of three instants has other exposures, which are ignored."""
     for instant, gains in enumerate((GAINS, GAINS, GAINS[::-1])):
         cameras = seen_with(tmp_path / "images" / str(instant), gains, seed=instant)
     folder = CaptureFolder(tmp_path / "images", cameras)
     given = [Capture(name, folder.photographs(name)) for name in folder.instants]
-    rig = corrected_rig(given, model, (112, 112), 1, 0, Renderer())
+    rig = correct_rig(given, model, (112, 112), 1, 0, Renderer())
     assert list(rig.gains) == NAMES
     found = np.array(list(rig.gains.values()))
     np.testing.assert_allclose(found, GAINS, rtol=0.03)
     np.testing.assert_allclose(found.prod(0), 1, rtol=1e-5)
 
-    path = tmp_path / "rig.json"
-    path.write_text(json_text(rig.calibrations(folder, given)))
-    next_one = CaptureFolder(tmp_path / "images" / "1", path)
-    capture = Capture("next", next_one.photographs(*next_one.instants))
+    capture = rig.apply(given[1])
     # what an instant would guess with
     monkeypatch.setattr("ghgs_lit.method.rounds.rounds.equalize", None)
     result = predict(capture, model, (112, 112), refine_cameras=0, refine_masks=0)
@@ -179,21 +122,14 @@ def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, ask
     np.testing.assert_allclose(result.batch.log_gains[0].exp(), found, rtol=1e-6)
     factors = torch.from_numpy(found).float()[..., None, None]
     torch.testing.assert_close(result.batch.images[0] * factors, plain.images[0])
-    again = corrected_rig([capture, capture], model, (112, 112), 1, 0, Renderer())
-    assert not again.gains
-    assert asked.batches[-1].log_gains is not None
-    for name, (camera, _) in again.calibrations(next_one, [capture]).items():
-        np.testing.assert_array_equal(camera.gains, rig.gains[name])
 
 
 def test_gains_of_some_cameras_alone_are_not_used(tmp_path):
     """Each instant then estimates them from unchanged photographs, bit for bit."""
-    path = seen_with(tmp_path, GAINS)
-    cameras = json.loads(path.read_text())["cameras"]
-    for name, gains in list(zip(NAMES, GAINS.tolist(), strict=True))[:3]:
-        cameras[name]["gains"] = gains
-    (tmp_path / "some.json").write_text(json.dumps({"cameras": cameras}))
-    some, without = (Capture.read(tmp_path, tmp_path / name) for name in ("some.json", "cameras.json"))
+    (without,) = captures(tmp_path, 1)
+    extrinsics = {photograph.name: photograph.extrinsics for photograph in without.photographs}
+    gains = dict(zip(NAMES[:3], GAINS, strict=False))
+    some = Rig(extrinsics, {}, {}, gains=gains).apply(without)
     np.testing.assert_array_equal(some.photographs[0].gains, GAINS[0])
     assert some.photographs[3].gains is None
     one, other = (capture.batch((56, 56)) for capture in (some, without))

@@ -1,6 +1,5 @@
 """Videos of a sequence, valid ones and ones with errors."""
 
-import csv
 import shutil
 import subprocess
 import sys
@@ -181,23 +180,6 @@ def test_empty_masks_for_a_while(place, capsys):
     assert "found 0 pixels" in out
 
 
-@pytest.mark.parametrize("first", [0, 1])
-def test_masks_of_videos_in_folders_count_from_0_or_from_1(place, first):
-    shutil.rmtree(place / "masks")
-    for camera, name in enumerate(FIGURE.names):
-        (place / "masks" / name).mkdir(parents=True)
-        for number in range(FRAMES):
-            found = np.roll(FIGURE.masks[camera], number, 0)
-            Image.fromarray(found).save(place / "masks" / name / f"{number + first:05d}.png")
-    folder = opened(place)
-    for number in (0, 5):
-        for camera, photograph in enumerate(folder.photographs(f"{number:06d}")):
-            assert (photograph.mask == np.roll(FIGURE.masks[camera], number, 0)).all()
-    (place / "masks" / "cam1" / f"{(FRAMES - 1 if first else 0) + first:05d}.png").unlink()
-    with pytest.raises(InputError, match="masks numbered from 0 to 5 or from 1 to 6; found '5 masks'"):
-        opened(place)
-
-
 def test_masks_beside_videos_count_where_nothing_else_is_said(place):
     """Also next to photographs; a given background takes precedence."""
     for camera, name in enumerate(FIGURE.names):
@@ -219,56 +201,6 @@ def test_offsets(place):
     assert found == {f"{n:06d}": alike(n) | {"cam1": n + 2} for n in range(4)}
     found = all_numbers(opened(place, sequence={"sync": {"cam1": -2, "cam2": 1}}))
     assert found == {f"{n:06d}": alike(n) | {"cam1": n - 2, "cam2": n + 1} for n in (2, 3, 4)}
-
-
-def write_csv(place, rows, header=("camera", "frame", "seconds")):
-    with (place / "times.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([header, *rows])
-    return {"sync": str(place / "times.csv")}
-
-
-def test_time_stamps(place):
-    """The nearest frame is used; one that is too far counts as missing, and its instant is predicted
-    without it."""
-    late = {"cam0": 0.0, "cam1": 0.04, "cam2": -0.2, "cam3": 0.0}
-    rows = [(c, n, n / FPS + late[c]) for c in FIGURE.names for n in range(FRAMES) if (c, n) != ("cam3", 2)]
-    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
-    assert found == {
-        f"{n:06d}": {name: n + 2 * (name == "cam2") for name in FIGURE.names if (name, n) != ("cam3", 2)}
-        for n in range(4)
-    }
-
-
-def test_time_stamps_say_how_rates_fit(place):
-    write_video(place / "images" / "cam3.mp4", frames_of(3, 3), fps=FPS // 2)
-    write_video(place / "masks" / "cam3.mp4", [mask(3)] * 3)
-    rows = [(c, n, n / FPS * (2 if c == "cam3" else 1)) for c in FIGURE.names for n in range(FRAMES)]
-    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
-    assert found["000004"] == alike(4) | {"cam3": 2}
-    assert found["000003"] == alike(3, ["cam0", "cam1", "cam2"])
-
-
-ROWS = [(name, n, n / FPS) for name in FIGURE.names for n in range(FRAMES)]
-WRONG = {
-    "a camera is missing": (ROWS[:-FRAMES], "the times of cam0, cam1, cam2, cam3"),
-    "other names": ([("left", n, t) for _, n, t in ROWS], "the times of .*found 'left'"),
-    "one more": ([*ROWS, ("cam9", 0, 0.0)], "the times of cam0, .*found '.*cam9'"),
-    "no number": ([*ROWS, ("cam0", "x", 0.0)], "camera,frame,seconds with numbers; found"),
-    "no time": ([*ROWS, ("cam0", 3, "nan")], "camera,frame,seconds with numbers; found"),
-    "no frame": ([*ROWS, ("cam0", "", 0.3)], "camera,frame,seconds with numbers; found"),
-    "400 digits": ([*ROWS, ("cam0", "9" * 400, 0.3)], "camera,frame,seconds with numbers; found"),
-    "a part of a line": ([*ROWS, ("cam0",)], "camera,frame,seconds with numbers; found"),
-    "other columns": (ROWS, "camera,frame,seconds", ("camera", "frame", "time")),
-    "nothing": ([], "the times of cam0, cam1, cam2, cam3; found ''"),
-    "no shared time": ([(c, n, t + 9 * (c == "cam1")) for c, n, t in ROWS], "times that all cameras share"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_time_stamps(place, name):
-    rows, line, *header = WRONG[name]
-    with pytest.raises(InputError, match=rf"times\.csv: expected .*{line}"):
-        opened(place, sequence=write_csv(place, rows, *header))
 
 
 def test_videos_without_ffmpeg(place, monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.verbs.predict import captures_of
+from ghgs_capture.verbs.predict import read_captures
 from tests.helpers.figures import Figure
 from tests.helpers.videos import number_of, numbered_frames
 
@@ -41,7 +41,7 @@ def numbers(photographs):
 
 def all_numbers(folder):
     """Numbers of a sequence, by instant and camera."""
-    return {capture.name: numbers(capture.photographs) for capture in captures_of(folder)}
+    return {capture.name: numbers(capture.photographs) for capture in read_captures(folder)}
 
 
 def alike(number, names=FIGURE.names):

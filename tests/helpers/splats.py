@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
+import zlib
 from unittest import mock
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ghgs_capture.export.page import _NARROW, _WIDE
 from ghgs_lit.rendering import RasterSettings, reference, render
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 from tests.helpers import cameras
@@ -159,3 +162,29 @@ def assert_cpu_matches_reference(
         assert torch.isfinite(gradients[name]).all(), name
         assert relative_error(gradients[name], true_gradients[name]) < gradient_budget, name
     return found
+
+
+def unpack(data: bytes, pixel, center, steps, like: Gaussians) -> Gaussians:
+    """The Gaussians of ``pack``, as the page reads them."""
+    planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
+    wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
+    centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
+    narrow = planes[4 * _WIDE :].T.astype(np.int64).cumsum(0)
+    narrow[:, [3, 5]] += narrow[:, [4]]
+    scales, colors, rotations = (torch.from_numpy(part) for part in np.split(narrow, [3, 7], axis=1))
+    turned = signed(rotations) / steps["rotation"]
+    square = turned.square().sum(1, keepdim=True)
+    values = {
+        "means": center + centers * (pixel / steps["center"]),
+        "scales": pixel * (signed(scales) / steps["scale"]).exp(),
+        "quaternions": torch.cat([1 - square, 2 * turned], dim=1) / (1 + square),
+        "colors": (colors[:, :3] & 255) / 255,
+        "opacities": (colors[:, 3] & 255) / steps["opacity"],
+    }
+    values = {name: value.float() for name, value in values.items()}
+    return dataclasses.replace(like, **values, image=None, pixel=None, splits=(len(centers),))
+
+
+def signed(numbers):
+    """Numbers modulo 256, from -128 to 127."""
+    return (numbers + 128 & 255) - 128

@@ -18,14 +18,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_capture.export.instants import mp4_bytes
-from ghgs_capture.export.page import page, unpack
-from ghgs_capture.export.prediction import CONVERTED, converted, half_turned, input_files
+from ghgs_capture.export.page import page
+from ghgs_capture.export.prediction import CONVERTED, convert, half_turn, input_files
 from ghgs_lit.metrics import psnr
 from ghgs_lit.ply import ply_bytes, read_ply
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
-from tests.helpers.splats import body, camera_ring
+from tests.helpers.splats import body, camera_ring, unpack
 
 UP = torch.tensor([0.0, -1.0, 0.0])
 
@@ -60,23 +60,23 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 @pytest.mark.parametrize(("name", "least"), [("compressed_ply", 45), ("spz", 45), ("sog", 55)])
 def test_compact_files_render_alike(gaussians, name, least, tmp_path):
     ply = ply_bytes(gaussians)
-    content = converted(name, gaussians)
+    content = convert(name, gaussians)
     assert len(content) < len(ply) / 2
     read = read_back(content, CONVERTED[name], tmp_path / "a.ply")
     if name == "spz":  # gaussforge leaves the axes of the file as they are
-        read = half_turned(read)
+        read = half_turn(read)
     assert decibels(read, gaussians) > least
 
 
 def test_spz_has_y_up_and_z_back_as_its_specification_says(gaussians):
     """Positions in the file (24 bits each, after a header of 16 bytes; nianticlabs/spz) are the PLY's with y
     and z negated; splat-transform, the reader of SuperSplat, negates them again."""
-    content = gzip.decompress(converted("spz", gaussians))
+    content = gzip.decompress(convert("spz", gaussians))
     count, bits = int.from_bytes(content[8:12], "little"), content[13]
     numbers = np.frombuffer(content[16 : 16 + 9 * count], np.uint8).reshape(count, 3, 3).astype(np.int32)
     stored = ((numbers << [8, 16, 24]).sum(-1, dtype=np.int32) >> 8) / 2**bits
     assert np.abs(stored - gaussians.means.numpy() * [1, -1, -1]).max() < 2 / 2**bits
-    spread, turned = (covariances(g) for g in (gaussians, half_turned(gaussians)))
+    spread, turned = (covariances(g) for g in (gaussians, half_turn(gaussians)))
     flip = np.diag([1, -1, -1])
     assert np.allclose(turned, flip @ spread @ flip, rtol=1e-4, atol=1e-6 * spread.max())
 

@@ -14,9 +14,9 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from ghgs_capture.export.page import COARSE, FINE, pack, unpack
+from ghgs_capture.export.page import COARSE, FINE, pack
 from ghgs_lit.types import Gaussians
-from tests.helpers.splats import body
+from tests.helpers.splats import body, unpack
 
 PIXEL, CENTER = 0.01, torch.tensor([0.1, -0.2, 30.0])
 

@@ -17,7 +17,7 @@ from ghgs_capture.calibration import calibrate
 from ghgs_capture.export import OutputOptions, output_options, write_prediction
 from ghgs_capture.export.subject import (
     AXES,
-    exported_subject,
+    export_subject,
     file_names,
     for_other_renderers,
     rotate_world,
@@ -54,11 +54,9 @@ def subject():
 
 
 def test_everything_is_written_and_reported(subject, tmp_path):
-    """The report lists each file with its size; other programs read depths and photographs."""
+    """The report lists each file with its size; other programs read photographs."""
     batch, prediction = subject
-    depth = prediction.depth.detach() + torch.rand(batch.masks.shape)
-    prediction = dataclasses.replace(prediction, depth=depth)
-    options = OutputOptions(("ply", "turntable", "depth", "inputs"), frames=2)
+    options = OutputOptions(("ply", "turntable", "inputs"), frames=2)
     paths = write_prediction(tmp_path, batch, prediction, Renderer(), options, {"seconds": {"predict": 1}})
     report = json.loads((tmp_path / "report.json").read_text())
     written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
@@ -66,9 +64,6 @@ def test_everything_is_written_and_reported(subject, tmp_path):
     assert report["gaussians"] == len(prediction.gaussians)
     assert report["seconds"] == {"predict": 1}
     valid = batch.masks[0].numpy()
-    exact = np.load(tmp_path / "depth.npz")
-    assert np.array_equal(exact["depth"][valid], depth[0].numpy()[valid])
-    assert np.isnan(exact["depth"][~valid]).all()
     photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
     assert np.array_equal(photograph[..., 3] > 0, valid[0])
     stored = read_matrices(tmp_path / "cameras.json")
@@ -140,7 +135,7 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     """Empty masks yield empty files and a report without numbers."""
     batch, _ = subject
     batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
-    options = OutputOptions(("ply", "html", "turntable", "depth", "inputs"), frames=1)
+    options = OutputOptions(("ply", "html", "turntable", "inputs"), frames=1)
     write_prediction(tmp_path, batch, Standin()(batch), Renderer(), options)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["gaussians"] == 0
@@ -171,7 +166,7 @@ def test_wrong_options_are_refused(changes, message):
 def test_options_are_read():
     """One name, a list with duplicates, and ``all``."""
     assert output_options(Predict(formats="ply")).formats == ("ply",)
-    assert output_options(Predict(formats=["ply", "depth", "ply"])).formats == ("ply", "depth")
+    assert output_options(Predict(formats=["ply", "html", "ply"])).formats == ("ply", "html")
     assert "inputs" in output_options(Predict(formats=["all"])).formats
     batch = example_batch()
     with pytest.raises(InputError, match="a batch of one subject; found 2"):
@@ -230,7 +225,7 @@ def test_other_viewers_see_the_inputs_as_ours_does():
     lose less than 1 dB; positions and rotations do not change."""
     batch, prediction = made_for_thin_pixels()
     ours = prediction.gaussians
-    subject = exported_subject(batch, prediction, Renderer(), OutputOptions())
+    subject = export_subject(batch, prediction, Renderer(), OutputOptions())
     found, converted = subject.for_other_renderers, for_other_renderers(ours, subject.pixel)
     between = camera_ring(5, 60, 60)[:, 1:]
     for cameras, gain in ((batch.cameras, 2.0), (between, -1.0)):
@@ -277,10 +272,10 @@ def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
     write("html", "inputs")
     write("ply")
     write("html", "inputs")
-    (tmp_path / "depth.npz").write_text("somebody's")
-    with pytest.raises(InputError, match=r"depth\.npz: expected no file, or one that an earlier prediction"):
-        write("ply", "depth")
-    assert (tmp_path / "depth.npz").read_text() == "somebody's"
+    (tmp_path / "gaussians.spz").write_text("somebody's")
+    with pytest.raises(InputError, match=r"gaussians\.spz: expected no file, or one that an earlier"):
+        write("ply", "spz")
+    assert (tmp_path / "gaussians.spz").read_text() == "somebody's"
     (tmp_path / "report.json").write_text("{}")
     with pytest.raises(InputError, match=r"found 'another file'"):
         write("ply")
