@@ -24,7 +24,7 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds.coarse import FILLED
 from ghgs_lit.method.rounds.gains import log_gammas
-from ghgs_lit.refinement import CameraRefinement, Refinement, Report, pixels_moved
+from ghgs_lit.refinement import CameraRefinement, Refinement, pixels_moved
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_config
@@ -47,7 +47,6 @@ class CapturePrediction:
     moved: tuple[float, ...] = ()
     #: share of the subject that refining masks changed in each crop
     changed: tuple[float, ...] = ()
-    refined: Report | None = None  #: gain of refining the Gaussians, if any; depths are unchanged
     #: reasons of ``auto``, by name of the refinement that it chose
     why: dict[str, str] = field(default_factory=dict)
     #: gammas that were undone, by camera
@@ -179,19 +178,15 @@ def predict_batch(
     """
     forward = forward or model
     moved = ()
-    refined = None
     if refine_cameras:
         given = batch
         batch = CameraRefinement(refine_cameras, model, renderer)(batch)
         moved = tuple(pixels_moved(given, batch)[0])
-    inputs = replace(batch, targets=None)
-    prediction = forward(inputs)
+    prediction = forward(replace(batch, targets=None))
     if refine:
-        refinement = Refinement(refine, renderer)
-        before = prediction.gaussians
-        prediction = replace(prediction, gaussians=refinement(before, batch))
-        refined = refinement.report(before, prediction.gaussians, inputs, lambda b: forward(b).gaussians)
-    return CapturePrediction(batch, prediction, moved, refined=refined)
+        gaussians = Refinement(refine, renderer)(prediction.gaussians, batch)
+        prediction = replace(prediction, gaussians=gaussians)
+    return CapturePrediction(batch, prediction, moved)
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:

@@ -64,7 +64,7 @@ def begin_to_read(run: "OfPhotographs") -> None:
 
 
 def check_cameras(folder: CaptureFolder) -> None:
-    """Print how well cameras and masks agree in up to ``_CHECKED`` instants.
+    """Print how well cameras and masks agree in the first of up to ``_CHECKED`` instants in which they do.
 
     Raises:
         InputError: cameras and masks disagree in all of these, or the only instant cannot be read.
@@ -72,25 +72,22 @@ def check_cameras(folder: CaptureFolder) -> None:
     from ghgs_capture.camera_report import diagnose
     from ghgs_capture.rig import spread
 
-    several = len(folder.instants) > 1
-    diagnoses = []
+    found = ""
     for name in spread(folder.instants, _CHECKED):
         try:
             diagnosis = diagnose(folder, name)
         except InputError:
-            if not several:
+            if len(folder.instants) == 1:
                 raise
             continue
-        diagnoses.append(diagnosis)
-        if several and not diagnosis.consistent:
-            print(f"instant {name}: cameras and masks do not fit: {diagnosis.line}", flush=True)
-    if not diagnoses:
+        if diagnosis.consistent:
+            print(diagnosis.line, flush=True)
+            return
+        found = diagnosis.line
+    if not found:
         print("cameras are not checked: none of the instants looked at can be read", flush=True)
         return
-    best = max(diagnoses, key=lambda diagnosis: diagnosis.consistent)
-    if not best.consistent:
-        raise InputError(
-            "cameras: expected cameras that fit photographs and masks"
-            f" (check_cameras=false goes on anyway); found {best.line}"
-        )
-    print(best.line, flush=True)
+    raise InputError(
+        "cameras: expected cameras that fit photographs and masks (check_cameras=false goes on anyway);"
+        f" found {found}"
+    )

@@ -4,7 +4,6 @@ import contextlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -298,7 +297,4 @@ def write_result(
         facts["gains"] = dict(zip(result.batch.views[0], gains, strict=True))
     if result.tones:
         facts["tones"] = result.tones
-    if result.refined is not None:
-        facts["refine"] = asdict(result.refined)
-        print(result.refined, flush=True)
     export.write_prediction(directory, result.batch, result.prediction, renderer, options, facts)

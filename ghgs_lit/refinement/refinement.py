@@ -1,8 +1,7 @@
 """Optimisation of predicted Gaussians towards the input images.
 
 A few steps suffice, and every change is bounded, so that parts that no input view shows stay as
-predicted. Good renders of the inputs are no evidence for other views (wrong geometry reproduces them,
-too), so :meth:`Refinement.report` holds one out and predicts again from the others."""
+predicted."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -14,8 +13,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import world_to_camera
-from ghgs_lit.metrics.functional import psnr, ssim
-from ghgs_lit.metrics.regions import box_of
+from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
@@ -40,22 +38,6 @@ NEAR = {
 #: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
 Weights = tuple[float, float, float]
 WEIGHTS: Weights = (0.8, 0.2, 0.1)
-
-
-@dataclass(frozen=True)
-class Report:
-    """PSNR in dB in the subject's box before and after: of the inputs, and, with four or more, of one
-    held out."""
-
-    steps: int
-    inputs: tuple[float, float]
-    held_out: tuple[float, float] | None
-
-    def __str__(self) -> str:
-        line = f"refine: {self.steps} steps; in the box, inputs {{:.2f}} -> {{:.2f}} dB".format(*self.inputs)
-        if self.held_out is None:
-            return line
-        return line + "; an input held out, from the others, {:.2f} -> {:.2f} dB".format(*self.held_out)
 
 
 class Descent:
@@ -147,37 +129,6 @@ class Refinement:
         for _ in range(self.steps):
             search.step(self.renderer, seen)
         return search.gaussians
-
-    def report(
-        self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]
-    ) -> Report:
-        """Measure the gain of a refinement: PSNR before and after.
-
-        With four or more inputs the last one is held out (two remaining views would show too little
-        of a person), which takes as long as prediction and refinement.
-
-        Args:
-            gaussians: before the refinement.
-            refined: after it.
-            batch: one element, from which both were predicted.
-            predict: predicts the Gaussians of a batch, here of the inputs without the last.
-        """
-        inputs = tuple(self._psnr(splats, batch) for splats in (gaussians, refined))
-        held_out = None
-        *seen, hidden = range(batch.images.shape[1])
-        if len(seen) > 2:
-            others = batch.of_views(seen)
-            predicted = predict(others)
-            both = predicted, self(predicted, others)
-            held_out = tuple(self._psnr(splats, batch.of_views([hidden])) for splats in both)
-        return Report(self.steps, inputs, held_out)
-
-    @torch.no_grad()
-    def _psnr(self, gaussians: Gaussians, batch: Batch) -> float:
-        photographs, _, cameras = seen_by(batch)
-        drawn = self.renderer(gaussians, cameras, background=0.0).image
-        images = drawn.flatten(0, 1).clamp(0, 1), photographs.flatten(0, 1)
-        return float(psnr(*images, box_of(batch.masks.flatten(0, 1))).mean())
 
 
 def seen_by(batch: Batch) -> Seen:

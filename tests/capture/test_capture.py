@@ -80,12 +80,8 @@ def test_python_refines_as_the_command_line_does(tmp_path):
     capture = Capture.read(tmp_path, Figure().write(tmp_path))
     model = Predictor(make_model("model=hull").eval())
     plain, refined = (predict(capture, model, 28, refine=steps) for steps in (0, 2))
-    assert plain.refined is None
     expected = Refinement(2, Renderer())(plain.gaussians, plain.batch)
     assert torch.equal(refined.gaussians.means, expected.means)
-    before, after = refined.refined.inputs
-    assert after > before
-    assert refined.refined.held_out is not None
 
 
 def _center(photograph):

@@ -40,22 +40,14 @@ def quality(gaussians, cameras, images, masks=None):
 
 
 def test_a_view_that_nobody_saw_gets_better():
-    """A view that is not an input improves, and the reported PSNR of the inputs is right."""
+    """A view that is not an input improves, as the inputs do."""
     splats, inputs, between = scene()
     target = painted_ellipsoid(between)[0]
     refinement = Refinement(15, RENDERER)
     refined = refinement(splats, inputs)
     assert quality(refined, between, target) > quality(splats, between, target) + 2
-    report = refinement.report(splats, refined, inputs, at_true_depth)
-    found = [
-        quality(gaussians, inputs.cameras, inputs.images, inputs.masks) for gaussians in (splats, refined)
-    ]
-    assert report.inputs == pytest.approx(found, abs=1e-3)
-    assert found[1] > found[0] + 2
-    assert report.held_out[1] > report.held_out[0] + 1
-    assert str(report).startswith(
-        f"refine: 15 steps; in the box, inputs {found[0]:.2f} -> {found[1]:.2f} dB; an input held"
-    )
+    before, after = (quality(g, inputs.cameras, inputs.images, inputs.masks) for g in (splats, refined))
+    assert after > before + 2
 
 
 def test_changes_are_bounded():
@@ -72,26 +64,6 @@ def test_changes_are_bounded():
     assert 0.03 < (refined.colors - splats.colors).abs().max() <= 0.0501
     assert ((refined.opacities > 0) & (refined.opacities < 1)).all()
     assert torch.equal(refined.quaternions, splats.quaternions)
-
-
-def test_the_input_that_is_held_out_takes_no_part():
-    """The held-out input is excluded from the new prediction, too, or its PSNR would mean nothing for
-    other views."""
-    splats, inputs, _ = scene(size=28)
-    refinement, given = Refinement(2, RENDERER), []
-
-    def predict(batch):
-        given.append(batch)
-        return at_true_depth(batch)
-
-    report = refinement.report(splats, splats, inputs, predict)
-    (others,) = given
-    assert torch.equal(others.images, inputs.images[:, :3])
-    before = at_true_depth(others)
-    hidden = inputs.cameras[:, 3:], inputs.images[:, 3:], inputs.masks[:, 3:]
-    found = [quality(gaussians, *hidden) for gaussians in (before, refinement(before, others))]
-    assert report.held_out == pytest.approx(found, abs=1e-3)
-    assert report.held_out[1] > report.held_out[0]
 
 
 def test_some_photographs_of_a_batch_are_a_batch():
@@ -114,16 +86,6 @@ def test_what_is_beside_the_subject_takes_no_part():
     for refined in found:
         assert torch.equal(refined.means, expected.means)
         assert torch.equal(refined.colors, expected.colors)
-
-
-@pytest.mark.parametrize("views", [2, 3])
-def test_few_inputs_are_refined_without_one_that_is_held_out(views):
-    """Three or fewer inputs have none held out, since two show too little of a person."""
-    splats, inputs, _ = scene(views=views, size=28)
-    refinement = Refinement(3, RENDERER)
-    report = refinement.report(splats, refinement(splats, inputs), inputs, at_true_depth)
-    assert report.held_out is None
-    assert "held out" not in str(report)
 
 
 def test_elements_are_refined_as_if_alone():
