@@ -7,10 +7,9 @@ from the other silhouettes. This needs neither a model nor surfaces that are vis
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import reduce
+from dataclasses import dataclass, replace
 from itertools import combinations
-from operator import add
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -71,26 +70,6 @@ class _Phase:
 
 _MEET = _Phase(12, TO, 1.0, is_exact=False)
 _LIE = _Phase(6, 3.0, 0.3, is_exact=True)
-
-
-@dataclass(frozen=True)
-class _Alignment:
-    """Cameras after steps of the ``free`` ones, and the mean distance of rays before each step."""
-
-    lens: Lenses
-    pose: Pose
-    free: Which
-    distances: tuple[float, ...] = ()
-
-    def advance(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
-        aligned = self
-        for _ in range(phase.steps):
-            equations = silhouettes.equations(aligned.lens, aligned.pose, phase)
-            steps = equations.solve(self.free)
-            are_all = bool(self.free.all())
-            moved = _apply_step(steps, aligned.lens, aligned.pose, are_all)
-            aligned = _Alignment(*moved, self.free, (*aligned.distances, equations.distance))
-        return aligned
 
 
 @torch.no_grad()
@@ -194,17 +173,18 @@ def _align(
     given = silhouettes.equations(lens, pose, _MEET)
     if given.distance < _COHERENT:
         return lens, pose, every, given.distance
-    start = _Alignment(lens, pose, every)
-    aligned = start.advance(_MEET, silhouettes)
+    free = every
+    cameras, distance = silhouettes.advance(lens, pose, _MEET, every)
     few = _minority(silhouettes, lens, pose) if alone and given.distance > _BUMPED else None
     if few is not None:
-        apart = _Alignment(lens, pose, few).advance(_MEET, silhouettes)
+        apart, distance_apart = silhouettes.advance(lens, pose, _MEET, few)
         # Two of three views nearly always agree.
         rest = 0.1 * _COHERENT if len(pose) == 3 else max(_COHERENT, _REST * given.distance)
-        enough = max(_AS_WELL * aligned.distances[-1], rest)
-        aligned = apart if apart.distances[-1] < enough else aligned
-    aligned = aligned.advance(_LIE, silhouettes)
-    return aligned.lens, aligned.pose, aligned.free, given.distance
+        if distance_apart < max(_AS_WELL * distance, rest):
+            cameras = apart
+            free = few
+    cameras, _ = silhouettes.advance(*cameras, _LIE, free)
+    return *cameras, free, given.distance
 
 
 def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | None:
@@ -218,8 +198,7 @@ def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | 
     return None
 
 
-@dataclass(frozen=True)
-class _Equations:
+class _Equations(NamedTuple):
     """Normal equations of a Gauss-Newton step, and number and total distance of rays before it."""
 
     normal: Float[Tensor, "n n"]
@@ -230,10 +209,6 @@ class _Equations:
     @property
     def distance(self) -> float:
         return self.total / max(self.rays, 1)
-
-    def __add__(self, other: "_Equations") -> "_Equations":
-        sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
-        return _Equations(*sums)
 
     def solve(self, free: Which) -> Float[Tensor, "V 7"]:
         """Solve for the step of the free cameras; 0 for the others."""
@@ -266,7 +241,19 @@ class _Silhouettes:
         """Normal equations of a Gauss-Newton step of all cameras, summed over the instants."""
         pixel = _pixel(lens, pose)
         parts = zip(self.outlines, lens, self.middle, strict=True)
-        return reduce(add, (_equations(*part, pose, phase, pixel) for part in parts))
+        each = [_equations(*part, pose, phase, pixel) for part in parts]
+        return _Equations(*map(sum, zip(*each, strict=True)))
+
+    def advance(
+        self, lens: Lenses, pose: Pose, phase: _Phase, free: Which
+    ) -> tuple[tuple[Lenses, Pose], float]:
+        """Cameras after the steps of a phase of the ``free`` ones, and the mean distance of rays before the
+        last step."""
+        are_all = bool(free.all())
+        for _ in range(phase.steps):
+            equations = self.equations(lens, pose, phase)
+            lens, pose = _apply_step(equations.solve(free), lens, pose, are_all)
+        return (lens, pose), equations.distance
 
 
 def _equations(
