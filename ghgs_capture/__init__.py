@@ -7,14 +7,15 @@ photographs, and the data set ``instants`` for the instants of a sequence.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from ghgs_lit.config.registry import offer, offer_verbs
+from ghgs_lit.config.registry import offer
 
 if TYPE_CHECKING:
     from ghgs_capture.capture import Capture
     from ghgs_capture.prediction import predict
 
 offer("data", instants="ghgs_capture.learning.Instants")
-offer_verbs(
+offer(
+    "verb",
     predict="ghgs_capture.verbs.Predict",
     view="ghgs_capture.verbs.View",
     adapt="ghgs_capture.verbs.Adapt",

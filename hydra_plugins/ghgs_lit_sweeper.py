@@ -25,7 +25,7 @@ class GridSweeper(basic_sweeper.BasicSweeper):
 
     def setup(self, *, hydra_context: Any, task_function: Any, config: Any) -> None:
         super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
-        self.verb = getattr(task_function, "name", self.verb)
+        self.verb = getattr(task_function, "keywords", {}).get("name", self.verb)
 
     def sweep(self, arguments: list[str]) -> Any:
         from ghgs_lit.runs.sweep import sweep  # Hydra imports its plugins for every application

@@ -13,7 +13,7 @@ ghgs table runs="$out" layout=table2 reported=false 'columns=[psnr,psnr_box,dept
 ghgs predict data=synthetic 'data.people={train: 1, val: 1}' data.size=252 subject=0 targets=midway refine=15 \
     "hydra.run.dir=$out/person"
 
-hull="$(dirname "$(dirname "$(grep -lx -e '- model=hull' "$out"/*/.hydra/overrides.yaml | head -n 1)")")"
+hull="$(dirname "$(grep -lx -e '  model: hull' "$out"/*/config.yaml | head -n 1)")"
 
 cat <<TEXT
 

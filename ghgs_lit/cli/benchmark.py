@@ -74,7 +74,6 @@ def run(verb: "Benchmark") -> None:
     check_options(verb, overrides())
     L.seed_everything(verb.seed, workers=True, verbose=False)
     device = pick_device(verb.device)
-    torch.set_num_threads(verb.threads or torch.get_num_threads())
     cases = cases_of(verb, device)
     data = build_data(verb)
     data.prepare_data([verb.split])

@@ -165,13 +165,19 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
         require(isinstance(node, Mapping), place, "a stage of the model", node)
     before = {node: trained[node] for node in (*MODEL_NODES, "chosen") if node in trained}
     after = OmegaConf.create(before)
-    if any(is_below(key, ("rounds",)) for key in given_keys()):
-        _check_rounds(checkpoint, before.get("rounds"), run.plain["rounds"])
     for key in (given.removesuffix(".kind") for given in given_keys()):  # another kind has other keys
         if key == "ablation":
-            _require_ablation(trained)
+            wanted = HydraConfig.get().runtime.choices["ablation"]
+            expected = f"{ablation_of(trained)}, as the checkpoint was trained"
+            expected += " (recalibration.neighborhood=... and .similarity=... act)"
+            require(wanted == ablation_of(trained), "ablation", expected, wanted)
         if not is_below(key, MODEL_NODES):
             continue
+        if is_below(key, ("rounds",)):  # Hydra composes no node to compare with
+            rounds = trained.get("rounds")
+            expected = f"no key of rounds, as the model of {checkpoint} has none (model=recurrent has)"
+            require(isinstance(rounds, Mapping), key, expected, "one")
+            read_node({**rounds, **run.plain["rounds"]}, "rounds")
         value = lookup(run.plain, key)
         if is_below(key, FREE):
             OmegaConf.update(after, key, value, merge=False, force_add=True)
@@ -181,29 +187,12 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
     return resolve_height(OmegaConf.to_container(after, resolve=True), trained)
 
 
-def _check_rounds(checkpoint: str, trained: Any, given: Mapping[str, Any]) -> None:
-    """Reject keys of ``rounds`` that the checkpoint's model does not have; Hydra composes no node to
-    compare with."""
-    if not isinstance(trained, Mapping):
-        expected = f"no key of rounds, as the model of {checkpoint} has none (model=recurrent has)"
-        raise InputError(f"rounds.{next(iter(given))}: expected {expected}; found one")
-    read_node({**trained, **given}, "rounds")
-
-
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
     """Reject values that differ from those of training; keys of :data:`FREE` may differ."""
     for name, wanted in flatten(value, key).items():
         before = lookup(trained, name)
         same = before == wanted or is_below(name, FREE)
         require(same, name, f"{before!r}, which the checkpoint's weights were trained with", wanted)
-
-
-def _require_ablation(trained: Mapping[str, Any]) -> None:
-    """Reject another ``ablation`` than that of training; its switches can be set one by one instead."""
-    before = ablation_of(trained)
-    wanted = HydraConfig.get().runtime.choices["ablation"]
-    switches = "recalibration.neighborhood=... and .similarity=... act"
-    require(wanted == before, "ablation", f"{before}, as the checkpoint was trained ({switches})", wanted)
 
 
 def with_chosen_targets(run: Measured) -> Measured:

@@ -4,7 +4,6 @@ import gc
 import os
 import signal
 import sys
-import warnings
 
 from ghgs_lit.runs.processes import Interrupted, interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again, keep_freed_memory
@@ -30,31 +29,9 @@ def _command(argv: list[str]) -> int:
         hint = did_you_mean(argv[1], verbs())
         print(f"ghgs: expected a verb ({', '.join(verbs())}); found {argv[1]!r}{hint}", file=sys.stderr)
         return 2
-    try:
-        os.getcwd()
-    except OSError as error:
-        print(
-            f"ghgs: .: expected a working directory (cd to another); found {error.strerror}", file=sys.stderr
-        )
-        return 1
     from ghgs_lit.cli.application import run  # here: imports Hydra
 
     return run(argv[1], argv)
-
-
-#: Path prefix of the files of this distribution's packages.
-_OURS = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "ghgs_")
-_THEIRS = warnings.formatwarning
-
-
-def _format_warning(
-    message: Warning, category: type, filename: str, lineno: int, line: str | None = None
-) -> str:
-    """Text of a warning, like ``warnings.formatwarning``; for warnings of this distribution one line
-    without the code location."""
-    if category is UserWarning and os.path.abspath(filename).startswith(_OURS):
-        return f"warning: {message}\n"
-    return _THEIRS(message, category, filename, lineno, line)
 
 
 def main() -> int:
@@ -64,7 +41,6 @@ def main() -> int:
         Exit code: 0: success; 1: bad input; 2: bad usage; 130, 143: interrupted.
     """
     argv = list(sys.argv)
-    warnings.formatwarning = _format_warning
     # Schedulers and daemons may have closed standard output and error.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:

@@ -16,7 +16,7 @@ from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
-from ghgs_lit.errors import require, require_choice
+from ghgs_lit.errors import require_choice
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import provenance
 from ghgs_lit.runtime.cores import allowed_cores
@@ -34,13 +34,12 @@ def run(verb: "Stress") -> None:
         verb: the configuration of the run.
 
     Raises:
-        InputError: there is no such stage or family.
+        InputError: there is no such stage.
         SystemExit: code 1: an error exceeds its budget.
     """
     directory = output_dir()
     write_config(verb, directory)
-    tasks = tasks_of(verb.stages, verb.families, verb.quick)
-    require(bool(tasks), "families", "a family that one of the stages has", verb.families)
+    tasks = tasks_of(verb.stages, verb.quick)
     rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)
     cells = pd.DataFrame(rows)
     content = {"cases": int(cells.cases.sum()), "failures": int(cells.failures.sum()), "cells": rows}
@@ -57,29 +56,23 @@ def run(verb: "Stress") -> None:
     publish(directory, "stress", ["Stress test", f"{summary}."], tables, content, failures)
 
 
-def tasks_of(
-    stages: Sequence[str] | None = None, families: Sequence[str] | None = None, quick: bool = False
-) -> list[Task]:
-    """Tasks of the chosen stages and families.
+def tasks_of(stages: Sequence[str] | None = None, quick: bool = False) -> list[Task]:
+    """Tasks of the chosen stages, one for each family of inputs that applies to a stage.
 
     Args:
         stages: names; None: all.
-        families: names; None: all. A stage has no task of a family that does not apply to it.
         quick: few cases of each: one of a stage that is slow, three of another.
 
     Raises:
         InputError: an unknown name.
     """
-    for key, names, known in (("stages", stages, STAGES), ("families", families, FAMILIES)):
-        for name in names or ():
-            require_choice(key, name, tuple(known))
     tasks = []
     for name in STAGES if stages is None else stages:
+        require_choice("stages", name, tuple(STAGES))
         seeds = STAGES[name].seeds
         if quick:
             seeds = 1 if seeds < 25 else 3
-        chosen = [family for family in STAGES[name].families if families is None or family in families]
-        tasks += [(name, family, seeds) for family in chosen]
+        tasks += [(name, family, seeds) for family in STAGES[name].families]
     return tasks
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Measured, Training, Verb
 from ghgs_lit.config.nodes import Check, PerScene, Texts, Timing
-from ghgs_lit.config.options import Count, PathText, Seed, Text, Words, Workers
+from ghgs_lit.config.options import Count, PathText, Seed, Text, Workers, name_type
 
 
 class Train(Training):
@@ -84,7 +84,7 @@ class Benchmark(Measured):
     """Checkpoint to run; null: random weights, for which only run times and differences are meaningful."""
     presets: Annotated[tuple[Text, ...], Field(min_length=1)] = ("none", "exact", "balanced", "fast")
     """Names of files in conf/skip; none, the reference, is always measured."""
-    knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
+    knobs: Annotated[dict | None, name_type("a mapping of lists or null")] = None
     """Lists of values by key, such as {recalibration.k: [4, 8]}; each preset is measured with every
     combination."""
     split: Literal["train", "val", "bench", "sealed"] = "val"
@@ -93,8 +93,6 @@ class Benchmark(Measured):
     """Number of subjects, taken from the start of the split and rounded up to whole batches; null: all."""
     timing: Timing = Timing()
     """How run times are measured."""
-    threads: int | None = Field(None, ge=1, le=1024)
-    """Threads of PyTorch, at most 1024; null: PyTorch's default."""
 
 
 class Stress(Verb):
@@ -107,8 +105,6 @@ class Stress(Verb):
     """Run some thousand cases within a minute."""
     stages: tuple[Text, ...] | None = None
     """Names of stages, as printed by a run; null: all."""
-    families: tuple[Text, ...] | None = None
-    """Names of families of inputs, as listed in stress.md; null: all."""
     workers: Workers | None = None
     """Number of processes; null: one per processor; 0: this process."""
 
@@ -120,7 +116,8 @@ class Table(Verb):
     example = "ghgs table runs=runs/train/sweep_..."
 
     runs: Annotated[
-        PathText | Annotated[tuple[PathText, ...], Field(min_length=1)], Words("a path or a list of paths")
+        PathText | Annotated[tuple[PathText, ...], Field(min_length=1)],
+        name_type("a path or a list of paths"),
     ]
     """Directory of a sweep, or a list of directories."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"

@@ -3,17 +3,12 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from ghgs_lit.cli.inputs import MODEL_NODES
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_config
-from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
-from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
-from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_config, write_inference
 from ghgs_lit.weights.published import export_weights, import_weights
 from ghgs_lit.weights.reading import file_of
@@ -21,8 +16,6 @@ from ghgs_lit.weights.switches import differences
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Export, Import
-
-_PATCHES = 8  # patches along each side of the images on which two models are compared
 
 
 def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
@@ -54,31 +47,8 @@ def run_import(verb: "Import") -> None:
     announce(out)
 
 
-@torch.no_grad()
-def parity(checkpoint: str, exported: str) -> dict[str, float]:
-    """Differences between the predictions of two checkpoints on images of a noisy ellipsoid.
-
-    Args:
-        checkpoint: Reference checkpoint.
-        exported: Checkpoint to compare.
-
-    Returns:
-        See :func:`ghgs_lit.diagnostics.benchmark.measure.differences`.
-    """
-    results = []
-    batch = None
-    for path in (exported, checkpoint):  # one model in memory at a time
-        predictor = Predictor.from_checkpoint(path)
-        if batch is None:
-            batch = ellipsoid_batch(0.15, 4, _PATCHES * predictor.model.encoder.patch_size, 1)
-        prediction = predictor(batch)
-        results.append((prediction, render(prediction.gaussians, batch.targets.cameras)))
-        del predictor
-    return prediction_differences(*results, batch.masks)
-
-
 def run_export(verb: "Export") -> None:
-    """Write the requested files, and print how they differ from the checkpoint.
+    """Write the requested files, and print how the model differs from the release.
 
     Raises:
         InputError: No file is requested, a file exists, or the checkpoint is wrong.
@@ -96,13 +66,6 @@ def run_export(verb: "Export") -> None:
             print(f"differs from the release: {', '.join(differing)}", flush=True)
     if inference is not None:
         write_inference(checkpoint, inference, verb.dtype)
-        measured = parity(checkpoint, inference)
         sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
-        print(
-            f"against the checkpoint, on an ellipsoid: {measured['psnr_to_none']:.1f} dB between"
-            f" renders; largest relative difference of depth {measured['depth']:.1e},"
-            f" of means {measured['means']:.1e}",
-            flush=True,
-        )
     announce(paths.popitem()[1])

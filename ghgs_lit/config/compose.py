@@ -128,10 +128,6 @@ def to_plain(cfg: DictConfig) -> dict[str, Any]:
     return {group: config[group] for group in KINDS if group in config} | config
 
 
-#: Groups whose files set keys of the whole configuration (``@package _global_``).
-_GLOBAL = ("experiment", "sweep", "ablation")
-
-
 def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
     """Check that each key set by the chosen ablation has its value, unless the command line sets it.
 
@@ -140,13 +136,8 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
         hydra_node: Node ``hydra`` of the application that composed it.
 
     Raises:
-        InputError: A key has another value, or a file that sets keys of the whole configuration lacks its
-            ``@package`` line.
+        InputError: A key has another value.
     """
-    for group in _GLOBAL:
-        if group in cfg:
-            file = f"{group}/{hydra_node.runtime.choices.get(group)}.yaml"
-            raise InputError(f"{file}: expected the first line '# @package _global_'; found none")
     name = hydra_node.runtime.choices.get("ablation")
     wanted = _ablation_values(name)
     composed = OmegaConf.to_container(cfg)

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Text, Words
+from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Text, name_type
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -32,7 +32,7 @@ class Calibration(Options):
     """Length of one unit in metres."""
     exif: Literal["auto", "stored", "shown"] = "auto"
     """Pixels of a rotated photograph that the calibration refers to: as stored or as shown."""
-    names: Annotated[dict | None, Words("a mapping of photographs to cameras or null")] = None
+    names: Annotated[dict | None, name_type("a mapping of photographs to cameras or null")] = None
     """Cameras of photographs whose name differs from the camera's: {photograph: camera}."""
 
 
@@ -46,7 +46,7 @@ class SequenceOptions(Options):
     """Number after the last instant (exclusive); negative: counted from the end."""
     step: Count = 1
     """Use every step-th instant."""
-    sync: Annotated[dict, Words("a mapping of cameras to frames")] | None = None
+    sync: Annotated[dict, name_type("a mapping of cameras to frames")] | None = None
     """Synchronization of videos. null: equal frame numbers are simultaneous. {camera: frames}: number of
     frames by which the camera began before the others."""
 

@@ -10,12 +10,9 @@ import difflib
 import inspect
 import itertools
 import os
-import re
 import textwrap
-import types
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 from omegaconf import OmegaConf
 from pydantic import (
@@ -25,27 +22,28 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    WithJsonSchema,
     model_validator,
 )
-from pydantic.fields import FieldInfo
 
 from ghgs_lit.errors import InputError, format_value, require
 
-_NOUNS = {type(None): "null", bool: "true or false", int: "an integer", float: "a number"}
-_NOUNS |= {str: "a text", tuple: "a list", dict: "a mapping"}
-_LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
+#: Words for the types of JSON schemas.
+_NOUNS = {
+    "null": "null", "boolean": "true or false", "integer": "an integer", "number": "a number",
+    "string": "a text", "array": "a list", "object": "a mapping",
+}  # fmt: skip
+_LIMITS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
 
 
-@dataclass(frozen=True)
-class Words:
-    """Metadata of a type: its description in messages."""
-
-    text: str
+def name_type(text: str) -> WithJsonSchema:
+    """Metadata of a type: its description in messages and help."""
+    return WithJsonSchema({"type": text})
 
 
-def describe_field(field: FieldInfo) -> str:
-    """Describe the values that ``field`` accepts, such as "an integer >= 1 or null"."""
-    return _describe_type(field.annotation, field.metadata)
+def describe_field(cls: type[BaseModel], name: str) -> str:
+    """Describe the values that a field of a class accepts, such as "an integer >= 1 or null"."""
+    return _describe(cls.model_json_schema()["properties"][name])
 
 
 def options_of(annotation: Any) -> type[BaseModel] | None:
@@ -69,37 +67,24 @@ def meanings(cls: type) -> dict[str, str]:
     return texts
 
 
-def _flatten_metadata(metadata: Iterable[Any]) -> list[Any]:
-    """Metadata of a type, including those inside pydantic's ``Field``."""
-    return [part for item in metadata for part in (item.metadata if isinstance(item, FieldInfo) else [item])]
-
-
-def _describe_type(annotation: Any, metadata: Iterable[Any] = ()) -> str:
-    metadata = _flatten_metadata(metadata)
-    if get_origin(annotation) is Annotated:
-        inner, *further = get_args(annotation)
-        return _describe_type(inner, [*metadata, *further])
-    for item in metadata:
-        if isinstance(item, Words):
-            return item.text
-    origin = get_origin(annotation)
-    args = get_args(annotation)
-    if origin in (Union, types.UnionType):
-        return " or ".join(_describe_type(arg, () if arg is type(None) else metadata) for arg in args)
-    if origin is Literal:
-        return "one of " * (len(args) > 1) + ", ".join(map(str, args))
-    if origin is tuple:
-        if len(args) == 2 and args[1] is Ellipsis:
-            return f"a list (each {_describe_type(args[0])})"
-        return f"a list of {len(args)} values (each {_describe_type(args[0])})"
-    if origin is dict:
-        return f"a mapping (each {_describe_type(args[1])})"
-    if options_of(annotation) is not None:
-        return "a mapping of its keys"
-    limits = {name: getattr(item, name) for item in metadata for name in _LIMITS if hasattr(item, name)}
-    words = " and ".join(f"{sign} {limits[name]}" for name, sign in _LIMITS.items() if name in limits)
-    noun = _NOUNS.get(annotation) or f"a {annotation.__name__}"
-    return f"{noun} {words}".strip()
+def _describe(schema: Mapping[str, Any]) -> str:
+    """Words for a JSON schema."""
+    if "anyOf" in schema:
+        return " or ".join(map(_describe, schema["anyOf"]))
+    if "const" in schema:
+        return str(schema["const"])
+    if "enum" in schema:
+        return f"one of {', '.join(map(str, schema['enum']))}"
+    words = [_NOUNS.get(schema.get("type"), schema.get("type", "a mapping of its keys"))]
+    limits = [f"{sign} {schema[name]}" for name, sign in _LIMITS.items() if name in schema]
+    words += [" and ".join(limits)] * bool(limits)
+    items = schema.get("prefixItems")
+    if items:
+        words.append(f"of {len(items)} values")
+    item = items[0] if items else schema.get("items") or schema.get("additionalProperties")
+    if isinstance(item, dict):
+        words.append(f"(each {_describe(item)})")
+    return " ".join(words)
 
 
 _T = TypeVar("_T", bound="Options")
@@ -126,7 +111,7 @@ def _to_pair(size: int | tuple[int, int]) -> tuple[int, int]:
 
 Text = Annotated[str, Field(min_length=1), BeforeValidator(_to_text)]
 PathText = Annotated[
-    str, Field(min_length=1), BeforeValidator(_to_text), AfterValidator(_check_home), Words("a path")
+    str, Field(min_length=1), BeforeValidator(_to_text), AfterValidator(_check_home), name_type("a path")
 ]
 Count = Annotated[int, Field(ge=1)]
 Index = Annotated[int, Field(ge=0)]
@@ -154,15 +139,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 class UnknownKey(InputError):
-    """Options have no field of this name.
-
-    Attributes:
-        key: Dotted key that was given.
-    """
-
-    def __init__(self, message: str, key: str):
-        super().__init__(message)
-        self.key = key
+    """Options have no field of this name."""
 
 
 class _Checked(type(BaseModel)):
@@ -207,9 +184,6 @@ class Options(BaseModel, metaclass=_Checked):
             default = cls.model_fields[name].default if name in cls.model_fields else None
             if isinstance(value, dict) and isinstance(default, Options):
                 given[name] = {**dict(default), **value}
-            elif isinstance(value, str) and re.fullmatch(r"[+-]?\d[\d_]*", value):
-                words = describe_field(cls.model_fields[name]) if name in cls.model_fields else ""
-                given[name] = value if re.search("text|path|mapping", words) else int(value)
         return given
 
     @classmethod
@@ -276,17 +250,16 @@ def _to_plain(value: Any) -> Any:
     return {key: _to_plain(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
-def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
+def _input_error(cls: type[Options], key: str, values: Any, error: ValidationError) -> InputError:
     """First of pydantic's errors as one line with its key; unknown keys come first, because a misspelt
     key may leave another one missing."""
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
-    cause = first.get("ctx", {}).get("error")
     path = [key] if key else []
-    field = None
+    wanted = first["msg"]
     nested = cls
     for name in first["loc"]:
-        if nested is None or not isinstance(values, Mapping | list | tuple):
+        if nested is None:
             break
         if isinstance(name, int):  # index in a list of options
             values = values[name]
@@ -294,23 +267,23 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         cls = nested
         if name not in cls.model_fields:
             break
-        field = cls.model_fields[name]
         path.append(name)
-        values = values.get(name)
-        nested = options_of(field.annotation)
+        wanted = describe_field(cls, name)
+        values = dict(values).get(name)
+        nested = options_of(cls.model_fields[name].annotation)
     dotted = ".".join(path)
+    cause = first.get("ctx", {}).get("error")
     if isinstance(cause, InputError):  # raised by a validator of several fields
         return InputError(f"{dotted}.{cause}" if dotted else str(cause))
     if first["type"] == "extra_forbidden":
         name = first["loc"][-1]
-        known = list(cls.model_fields)
-        choices = f"one of {', '.join(sorted(known))}" if known else "no keys"
-        text = f"expected {choices}; found {name!r}{did_you_mean(name, known)}"
-        return UnknownKey(f"{dotted} key: {text}" if dotted else f"{name}: {text}", ".".join([*path, name]))
-    if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
+        known = ", ".join(sorted(cls.model_fields))
+        expected = f"one of {known}" if known else "no keys"
+        hint = did_you_mean(name, cls.model_fields)
+        return UnknownKey(f"{'.'.join([*path, name])}: expected {expected}; found {name!r}{hint}")
+    if first["type"] == "missing" and first["loc"][-1] == path[-1]:
         return InputError(f"{dotted}: expected a value; found none")
-    wanted = str(cause) if cause is not None else describe_field(field) if field is not None else first["msg"]
-    return InputError(f"{dotted}: expected {wanted}; found {format_value(_to_plain(values))}")
+    return InputError(f"{dotted}: expected {cause or wanted}; found {format_value(_to_plain(values))}")
 
 
 def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:

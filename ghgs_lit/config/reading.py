@@ -1,4 +1,4 @@
-"""Read overrides and files for Hydra, and restrict what external files may set.
+"""Read files for Hydra, and restrict what external files may set.
 
 External files are those of ``--config-dir`` and ``hydra.searchpath``, which may be untrusted. Their keys
 of the package's groups are options and validated as such. The node ``hydra``, however, can set
@@ -11,18 +11,14 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.override_parser import overrides_parser
-from hydra.core.override_parser.overrides_visitor import HydraOverrideVisitor
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
-from omegaconf import DictConfig, OmegaConf, _utils
+from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.defaults import open_nodes, verb_values
 from ghgs_lit.config.folder import conf_dir
@@ -31,24 +27,8 @@ from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import check_yaml, read_parsed
 
-#: Keys of launchers: names and numbers for the queue and the processes, no commands.
-_LAUNCHER = """
-    n_jobs backend prefer verbose timeout batch_size
-    submitit_folder timeout_min cpus_per_task gpus_per_node tasks_per_node mem_gb nodes name stderr_to_stdout
-    partition qos comment constraint exclude gres cpus_per_gpu gpus_per_task mem_per_gpu mem_per_cpu account
-    signal_delay_s max_num_timeout array_parallelism
-"""
 #: Keys below ``hydra`` that an external file may set.
-SETTABLE = (
-    "mode", "verbose", "run.dir", "sweep.dir", "sweep.subdir", "job.name", "job.chdir", "job.config",
-    *(f"launcher.{key}" for key in _LAUNCHER.split()),
-    "sweeper.params", "sweeper.max_batch_size",
-)  # fmt: skip
-#: Classes that it may set; Hydra requires these to be registered plugins.
-_CLASSES = {
-    "launcher._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
-    "sweeper._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
-}
+SETTABLE = ("mode", "run.dir", "sweep.dir", "sweep.subdir", "job.name", "sweeper.params")
 #: Interpolation that calls no resolver.
 _REFERENCE = re.compile(r"\$\{[\w.\[\]-]+\}")
 #: Limit of the number of values, far above that of any configuration.
@@ -83,10 +63,7 @@ def _parse(text: str) -> tuple[dict[str, str | None], DictConfig]:
 
 
 def read_as_ghgs() -> None:
-    """Make Hydra read files with :class:`FileConfigSource` in this process from now on, and keep the
-    spelling of names."""
-    overrides_parser.HydraOverrideVisitor = SpellingVisitor
-    _utils.get_yaml_loader = yaml_loader
+    """Make Hydra read files with :class:`FileConfigSource` in this process from now on."""
     SourcesRegistry.instance().types["file"] = FileConfigSource
 
 
@@ -96,64 +73,12 @@ def reading_as_ghgs() -> Iterator[None]:
     affected."""
     Plugins.instance()  # registers Hydra's sources
     types = SourcesRegistry.instance().types
-    before = types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader
+    before = types["file"]
     read_as_ghgs()
     try:
         yield
     finally:
-        types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader = before
-
-
-#: Keys of Hydra that are paths or names, even if they look like numbers.
-_PATHS = ("hydra.run.", "hydra.sweep.", "hydra.job.")
-#: Override functions whose arguments are numbers.
-_OF_NUMBERS = ("range", "interval")
-
-_yaml_loader = _utils.get_yaml_loader
-
-
-class SpellingVisitor(HydraOverrideVisitor):
-    """Hydra's parser of overrides, modified to keep integers with unusual spelling as text.
-
-    For example, Hydra reads ``2024_05_17`` as 20240517. Numeric keys accept such texts, too.
-    """
-
-    _is_path = False
-    _are_numbers = False
-
-    def visitKey(self, ctx: Any) -> Any:
-        key = super().visitKey(ctx)
-        self._is_path = key.key_or_group.startswith(_PATHS)
-        return key
-
-    def visitFunction(self, ctx: Any) -> Any:
-        self._are_numbers = ctx.getText().partition("(")[0] in _OF_NUMBERS
-        try:
-            return super().visitFunction(ctx)
-        finally:
-            self._are_numbers = False
-
-    def _createPrimitive(self, ctx: Any) -> Any:
-        value = super()._createPrimitive(ctx)
-        if self._are_numbers or not (type(value) is int or (type(value) is float and self._is_path)):
-            return value
-        return _keep_spelling(value, ctx.getText().strip())
-
-
-def yaml_loader() -> type[yaml.SafeLoader]:
-    """OmegaConf's YAML loader, modified to keep spellings, too: ``0426`` is octal in YAML 1.1."""
-    loader = _yaml_loader()
-    loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
-    return loader
-
-
-def _construct_int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
-    return _keep_spelling(loader.construct_yaml_int(node), node.value)
-
-
-def _keep_spelling(value: float, text: str) -> float | str:
-    """The number, or its text if numbers are not usually written this way."""
-    return value if str(value) == text.removeprefix("+") else text
+        types["file"] = before
 
 
 def check_file(file: Path, name: str, package: str, config: Any) -> None:
@@ -179,37 +104,22 @@ def check_file(file: Path, name: str, package: str, config: Any) -> None:
     is_of_hydra = groups[:1] == ["hydra"]
     # Packages accumulate along the lists of defaults.
     require("hydra" not in package, f"{file}: @package", "a package outside of hydra", package)
-    for entry in chain(*map(_groups, content.pop("defaults", None) or ())):
-        moves = "hydra" in entry.partition("@")[2] or (is_of_hydra and re.search("@|^/", entry))
-        require(not moves, f"{file}: defaults", "nothing that is moved into hydra", entry)
+    for entry in content.pop("defaults", None) or ():
+        for group in entry if isinstance(entry, dict) else [str(entry)]:
+            moves = "hydra" in group.partition("@")[2] or (is_of_hydra and re.search("@|^/", group))
+            require(not moves, f"{file}: defaults", "nothing that is moved into hydra", group)
     prefix = ".".join(groups) if is_of_hydra and package != "_global_" else ""
     for key, value in flatten(content, prefix).items():
-        below = key.removeprefix("hydra").removeprefix(".")
-        if is_below(key, ["hydra"]) and not _may_set(below, value):
-            expected = f"keys of {', '.join(SETTABLE[:8])}, and names and numbers of launcher and sweeper"
+        if is_below(key, ["hydra"]) and not _may_set(key.removeprefix("hydra."), value):
+            expected = f"no keys but {', '.join(SETTABLE)}, with values that are no objects"
             raise InputError(f"{file}: hydra: expected {expected}; found {key}={value!r}")
 
 
-def _groups(entry: Any) -> list[str]:
-    """Groups and packages of an entry of a defaults list."""
-    return list(entry) if isinstance(entry, dict) else [str(entry)]
-
-
 def _may_set(key: str, value: Any) -> bool:
-    """Whether an external file may set a dotted key below ``hydra`` to an unresolved value."""
-    if key in _CLASSES:
-        return isinstance(value, str) and re.fullmatch(_CLASSES[key], value) is not None
-    # Hydra's instantiate has keywords such as _target_; keys of a grid are overrides.
-    if re.search(r"(^|\.)_|hydra", key):
+    """Whether an external file may set a dotted key below ``hydra`` to an unresolved value: Hydra
+    instantiates mappings with keys such as ``_target_``, also where a value refers to one."""
+    if not is_below(key, SETTABLE) or re.search(r"\._|hydra", key):  # keys of a grid are overrides
         return False
     values = value if isinstance(value, list) else [value]
-    return value == {} or (is_below(key, SETTABLE) and all(_is_plain(item, key) for item in values))
-
-
-def _is_plain(value: Any, key: str) -> bool:
-    """Whether a scalar is on one line and, for objects that Hydra instantiates, does not refer to another
-    node."""
-    if not isinstance(value, str):
-        return value is None or isinstance(value, bool | int | float)
-    refers = re.match(r"\s*\$\{(?!hydra\.)", value) and is_below(key, ["launcher", "sweeper"])
-    return value.isprintable() and not refers
+    refers = key.startswith("sweeper") and any(re.match(r"\s*\$", str(item)) for item in values)
+    return not refers and not any(isinstance(item, dict | list) for item in values)

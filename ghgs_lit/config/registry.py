@@ -1,20 +1,17 @@
 """Registry of the kinds of options that a configuration may build, by group, and of verbs.
 
 A configuration can come from an untrusted checkpoint, so it never contains an import path: a node such as
-``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Kinds and verbs
-are registered by the files of the group's subpackage, such as ``ghgs_lit/method/heads``, and by plug-ins:
-modules in the environment variable ``GHGS_PLUGINS`` (Python files or module names, separated as in
-``PATH``) or entry points in the group ``ghgs_lit.plugins``. The other packages of this distribution,
-``ghgs_people`` and ``ghgs_capture``, are such entry points; they register import paths, so that nothing
-is imported before it is chosen.
+``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Plug-ins register
+kinds and verbs: modules in the environment variable ``GHGS_PLUGINS`` (Python files or module names,
+separated as in ``PATH``) or entry points in the group ``ghgs_lit.plugins``. The other packages of this
+distribution, ``ghgs_people`` and ``ghgs_capture``, are such entry points; they register import paths, so
+that nothing is imported before it is chosen.
 """
 
 import gc
 import importlib
 import importlib.metadata
-import importlib.util
 import os
-import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -24,13 +21,13 @@ from typing import Any, TypeVar
 from omegaconf import OmegaConf
 
 from ghgs_lit.config.options import Options, did_you_mean
-from ghgs_lit.errors import InputError, format_value
+from ghgs_lit.errors import InputError, format_value, require
 
 VARIABLE = "GHGS_PLUGINS"
 GROUP = "ghgs_lit.plugins"
 #: Registered groups that are not configuration groups: verbs, body models with known parts, and terms of the
 #: loss, which are keys of ``loss.weights``.
-_VERBS = "verb"
+VERB = "verb"
 PARTS = "parts"
 TERM = "term"
 
@@ -43,10 +40,14 @@ def load_plugins() -> None:
     Raises:
         InputError: A file is missing, or another module has its name.
     """
-    names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
-    for name in (*names, *_installed_plugins()):
-        # Files opened while the collector is disabled would be frozen, and not flushed at exit.
-        gc.enable()
+    # Files opened while the collector is disabled would be frozen, and not flushed at exit.
+    gc.enable()
+    for entry in os.environ.get(VARIABLE, "").split(os.pathsep):
+        if entry.strip().endswith(".py"):
+            _import_file(Path(os.path.realpath(os.path.expanduser(entry.strip()))))
+        elif entry.strip():
+            importlib.import_module(entry.strip())
+    for name in _installed_plugins():
         importlib.import_module(name)
 
 
@@ -55,27 +56,16 @@ def _installed_plugins() -> tuple[str, ...]:
     return tuple(point.value for point in importlib.metadata.entry_points(group=GROUP))
 
 
-def _module_of(entry: str) -> str:
-    """Module name of an entry of ``GHGS_PLUGINS``; the folder of a Python file is added to the import
-    path."""
-    entry = entry.strip()
-    if not entry.endswith(".py"):
-        return entry
-    path = Path(os.path.realpath(os.path.expanduser(entry)))
-    if not path.is_file():
-        raise InputError(f"{VARIABLE}: expected a Python file; found no {path}")
-    if not path.stem.isidentifier():
-        raise InputError(f"{VARIABLE}: expected a file name that Python can import; found {path.name!r}")
-    folder = str(path.parent)
-    if folder not in sys.path:
+def _import_file(path: Path) -> None:
+    """Import a Python file by its name, after adding its folder to the import path."""
+    require(path.is_file(), VARIABLE, "a Python file", str(path))
+    if str(path.parent) not in sys.path:
         # Appended, so that the file's neighbours do not shadow installed packages.
-        sys.path.append(folder)
+        sys.path.append(str(path.parent))
         importlib.invalidate_caches()
-    spec = importlib.util.find_spec(path.stem)
-    if spec is None or spec.origin is None or Path(spec.origin).resolve() != path:
-        found = spec.origin if spec else "none"
-        raise InputError(f"{VARIABLE}: expected a name that no other module has for {path}; found {found}")
-    return path.stem
+    file = importlib.import_module(path.stem).__file__
+    fits = file is not None and Path(file).resolve() == path
+    require(fits, VARIABLE, f"a name that no other module has for {path}", file)
 
 
 _C = TypeVar("_C", bound=Callable)
@@ -154,7 +144,7 @@ TERMS: dict[str, str] = {
 }
 
 #: Shipped import paths by group.
-_SHIPPED: dict[str, Mapping[str | None, str]] = {**KINDS, _VERBS: VERBS, PARTS: {}, TERM: TERMS}
+_SHIPPED: dict[str, Mapping[str | None, str]] = {**KINDS, VERB: VERBS, PARTS: {}, TERM: TERMS}
 
 #: Groups of named nodes, such as ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
@@ -164,11 +154,13 @@ _REGISTERED: dict[tuple[str, str], type[Options] | str] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
-    """Decorator that registers options as ``<group>: {kind: <kind>, ...}`` or, with the group ``term``, a
-    function or class as the loss term weighted by ``loss.weights.<kind>``.
+    """Decorator that registers options as ``<group>: {kind: <kind>, ...}``; with the group ``term``, a
+    function or class as the loss term weighted by ``loss.weights.<kind>``; with the group ``verb``, a
+    :class:`ghgs_lit.cli.verb.Verb` as ``ghgs <kind>``, which without a file ``<kind>.yaml`` in
+    ``--config-dir`` has its keys and no groups.
 
     Args:
-        group: One of :data:`KINDS`, :data:`TERM` or :data:`PARTS`.
+        group: One of :data:`KINDS`, :data:`TERM`, :data:`VERB` or :data:`PARTS`.
         kind: A new kind of the group.
 
     Raises:
@@ -182,22 +174,11 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
     return keep
 
 
-def register_verb(name: str) -> Callable[[_C], _C]:
-    """Class decorator that registers a :class:`ghgs_lit.cli.verb.Verb` as ``ghgs <name>``.
-
-    Without a file ``<name>.yaml`` in ``--config-dir`` the verb has its keys and no groups.
-
-    Raises:
-        InputError: The name is taken.
-    """
-    return register(_VERBS, name)
-
-
 def offer(group: str, **paths: str) -> None:
     """Register options by import path; they are imported when chosen.
 
     Args:
-        group: One of :data:`KINDS`, or :data:`PARTS`.
+        group: See :func:`register`.
         **paths: Import path by kind, such as ``scans="my_package.scans.Scans"``.
 
     Raises:
@@ -207,21 +188,9 @@ def offer(group: str, **paths: str) -> None:
         _keep(group, kind, path)
 
 
-def offer_verbs(**paths: str) -> None:
-    """Register verbs by import path, see :func:`offer`.
-
-    Args:
-        **paths: Import path by name of the verb.
-
-    Raises:
-        InputError: A name is taken.
-    """
-    offer(_VERBS, **paths)
-
-
 def _keep(group: str, kind: str, what: type[Options] | str) -> None:
     if group not in _SHIPPED:
-        raise InputError(f"register: expected one of {', '.join([*KINDS, TERM])}; found {group!r}")
+        raise InputError(f"register: expected one of {', '.join([*KINDS, TERM, VERB])}; found {group!r}")
     known = _SHIPPED[group]
     before = _REGISTERED.get((group, kind), what)
     if kind in known or _path_of(before) != _path_of(what):
@@ -247,7 +216,7 @@ def _class_of(what: type[Options] | str) -> type[Options]:
 def verbs() -> list[str]:
     """Names of all verbs, those of plug-ins last."""
     load_plugins()
-    return [*VERBS, *(name for group, name in _REGISTERED if group == _VERBS)]
+    return [*VERBS, *(name for group, name in _REGISTERED if group == VERB)]
 
 
 def verb_class(name: str) -> type[Options]:
@@ -258,27 +227,12 @@ def verb_class(name: str) -> type[Options]:
     """
     if name not in VERBS:
         load_plugins()
-    return _class_of(VERBS.get(name) or _REGISTERED[_VERBS, name])
-
-
-@cache
-def _import_subpackage(group: str) -> None:
-    """Import all files of the group's subpackage, which register their kinds."""
-    parts = next(iter(KINDS[group].values())).split(".")
-    subpackage = ".".join(parts[: 3 if parts[1] == "method" else 2])
-    for file in pkgutil.iter_modules(importlib.import_module(subpackage).__path__, f"{subpackage}."):
-        importlib.import_module(file.name)
-
-
-def _load(group: str) -> None:
-    load_plugins()
-    if group in KINDS and None not in KINDS[group]:
-        _import_subpackage(group)
+    return _class_of(VERBS.get(name) or _REGISTERED[VERB, name])
 
 
 def kinds_of(group: str) -> list[str | None]:
     """All kinds of a group, including registered ones; None: the group has no kinds."""
-    _load(group)
+    load_plugins()
     return [*_SHIPPED.get(group, {}), *(kind for of, kind in _REGISTERED if of == group)]
 
 
@@ -295,7 +249,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     """
     known = _SHIPPED[group]
     if isinstance(kind, str) and kind not in known:
-        _load(group)
+        load_plugins()
         if (group, kind) in _REGISTERED:
             return _class_of(_REGISTERED[group, kind])
     if not (kind is None or isinstance(kind, str)) or kind not in known:

@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from pydantic import Field
 
-from ghgs_lit.config.options import Index, Options, Text, Words
+from ghgs_lit.config.options import Index, Options, Text, name_type
 from ghgs_lit.files import write_atomically
 from ghgs_lit.runs.processes import handle, handlers, interrupt
 from ghgs_lit.weights import frozen
@@ -92,7 +92,7 @@ class AfterSteps(Callback):
 FileName = Annotated[
     str,
     Field(pattern=r"^([^/\\{}\x00-\x1f]|\{[\w/]+(:[\w.]*)?\})+$"),
-    Words("a name without folders, such as best or {step}"),
+    name_type("a name without folders, such as best or {step}"),
 ]
 
 

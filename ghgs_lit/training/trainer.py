@@ -7,7 +7,7 @@ from lightning.pytorch.profilers import SimpleProfiler
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, Share, Words
+from ghgs_lit.config.options import Count, Index, Options, Share, name_type
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import round_products
 
@@ -15,14 +15,14 @@ from ghgs_lit.geometry.precision import round_products
 Duration = Annotated[
     Annotated[str, Field(pattern=r"^\d{1,8}(:\d{1,9}){3}$")]
     | dict[str, Annotated[float, Field(ge=0, le=1e8)]],
-    Words("days:hours:minutes:seconds such as 00:00:10:00"),
+    name_type("days:hours:minutes:seconds such as 00:00:10:00"),
 ]
 
 
 #: Lightning's other precisions change the dtype of weights (``bf16-true``) or need another library.
 Precision = Annotated[
     Literal["32-true", "tf32", "bf16-mixed", "16-mixed", "32", "bf16", "16", 32, 16],
-    Words("32-true, tf32, bf16-mixed or 16-mixed"),
+    name_type("32-true, tf32, bf16-mixed or 16-mixed"),
 ]
 
 

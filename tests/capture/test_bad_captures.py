@@ -181,7 +181,7 @@ BAD = {
     ),
     "no such option": (
         lambda p: {"calibration": {"axis": "y"}},
-        "calibration key: expected one of",
+        "calibration.axis: expected one of",
         "found 'axis'",
     ),
     "no segmenter": (

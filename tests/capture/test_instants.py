@@ -87,7 +87,7 @@ REFUSED = {
     "nothing after the end": ({"start": 6}, r"sequence\.start: expected a part of 6 instants; found"),
     "nothing before the start": ({"start": 3, "stop": 2}, "from 3 to 2"),
     "no step": ({"step": 0}, r"sequence\.step: expected an integer >= 1; found 0"),
-    "no such key": ({"skip": 1}, "sequence key: expected one of .*found 'skip'"),
+    "no such key": ({"skip": 1}, "sequence.skip: expected one of .*found 'skip'"),
 }
 
 

@@ -87,7 +87,7 @@ def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb,
 @pytest.mark.parametrize(
     ("model", "said", "refused"),
     [
-        ("recurrent", "rounds.heigt=null", r"rounds key: .* found 'heigt' \(did you mean height\?\)"),
+        ("recurrent", "rounds.heigt=null", r"rounds\.heigt: .* found 'heigt' \(did you mean height\?\)"),
         ("recurrent", "rounds.height=-3", r"rounds\.height: expected .*; found -3"),
         (
             "hull",

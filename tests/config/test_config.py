@@ -159,11 +159,11 @@ def test_combinations_that_are_one_configuration_are_counted(monkeypatch, capsys
         ),
         (
             {"ablation": "optimizer: {lr: 1}"},
-            "ablation/mine.yaml: expected the first line '# @package _global_'; found none",
+            "optimizer.lr: expected 1, as ablation/mine.yaml sets it; found ",
         ),
         (
             {"experiment": "# @package _global_\ndefaults: [{override /ablation: neither}]\n"},
-            "experiment/mine: expected no choice of an ablation, which composes last",
+            "Could not override 'ablation'",
         ),
     ],
 )

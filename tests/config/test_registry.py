@@ -9,7 +9,7 @@ from itertools import chain
 import pytest
 
 import ghgs_capture
-import ghgs_lit.method.heads
+import ghgs_lit
 import ghgs_people
 from ghgs_lit.config import build, registry
 from ghgs_lit.config.options import Options
@@ -107,7 +107,7 @@ def test_kinds_of_the_users_own(monkeypatch):
 
     assert build({"kind": "sphere", "radius": 2}, "bounds") == "a sphere of 2.0 m"
     with pytest.raises(
-        InputError, match=r"bounds key: expected one of radius; found 'radios' \(did you mean radius"
+        InputError, match=r"bounds\.radios: expected one of radius; found 'radios' \(did you mean radius"
     ):
         read_node({"kind": "sphere", "radios": 2}, "bounds")
     with pytest.raises(
@@ -118,22 +118,6 @@ def test_kinds_of_the_users_own(monkeypatch):
         register("bounds", "hull")(Sphere)
     with pytest.raises(InputError, match=r"register: expected one of .*; found 'shape'"):
         register("shape", "sphere")(Sphere)
-
-
-def test_a_file_of_a_subpackage_registers_its_kinds(monkeypatch, tmp_path):
-    """Another depth head is one file next to the others; no list contains it."""
-    (tmp_path / "flat.py").write_text(
-        "from ghgs_lit.config import register\n"
-        "from ghgs_lit.config.options import Options\n\n\n"
-        '@register("depth_head", "flat")\n'
-        "class Flat(Options):\n"
-        "    metres: float = 2.0\n"
-    )
-    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
-    monkeypatch.setattr("ghgs_lit.method.heads.__path__", [*ghgs_lit.method.heads.__path__, str(tmp_path)])
-    registry._import_subpackage.cache_clear()
-    assert read_node({"kind": "flat", "metres": 3}, "depth_head").metres == 3.0
-    assert registry.kinds_of("depth_head") == ["dpt", "flat"]
 
 
 def test_a_node_without_a_kind_names_those_that_there_are():

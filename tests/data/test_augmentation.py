@@ -306,7 +306,7 @@ def test_shipped_variation_is_built():
         ({"gamma": 1e9}, "augmentation.gamma: expected a number >= 0 and <= 1; found"),
         ({"cut": 2}, "augmentation.cut: expected a number >= 0 and <= 1; found 2"),
         ({"calibration": -1}, "augmentation.calibration: expected a number >= 0; found -1"),
-        ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole_chance"),
+        ({"mask_holes": 1}, "augmentation.mask_holes: .*did you mean mask_hole_chance"),
     ],
 )
 def test_impossible_values_are_refused(boxes, values, message):

@@ -43,7 +43,8 @@ def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
 )
 def test_a_wrong_key_is_named(options, key, hint):
     """A misspelt key must not be ignored."""
-    with pytest.raises(InputError, match=f"data key: expected one of .*batch_size, .*; found '{key}'{hint}"):
+    message = f"data.{key}: expected one of .*batch_size, .*; found '{key}'{hint}"
+    with pytest.raises(InputError, match=message):
         options(size=28, **{key: 1})
 
 

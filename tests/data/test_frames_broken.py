@@ -376,7 +376,7 @@ ZJU_SETTINGS = [
     ("data.split.train=[]", "data.split.train: expected a list"),
     (
         "data.split.train=[{sequence: [386], frames: [0, 5, 1]}]",
-        "data.split.train key: expected one of frames, sequences; found 'sequence'",
+        "data.split.train.sequence: expected one of frames, sequences; found 'sequence'",
     ),
     ("data.cameras=1", "data.cameras: expected an integer >= 2 or null; found 1"),
     ("data.cameras=24", "annots.npy: expected 24 cameras; found 23"),

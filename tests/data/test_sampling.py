@@ -225,7 +225,7 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
             {"views": V4 | {"training": "odd"}},
             "views.training: expected one of any, even, uneven",
         ),
-        ({"views": V4 | {"trainign": "any"}}, "views key: expected one of .*; found 'trainign'"),
+        ({"views": V4 | {"trainign": "any"}}, "views.trainign: expected one of .*; found 'trainign'"),
         ({"targets": {"name": "sideways"}}, "targets.kind: expected one of release, midway, random"),
         (
             {"targets": RELEASE | {"training_views": [7]}},
@@ -237,7 +237,7 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
         ),
         ({"size": [3, 4, 5]}, "data.size: expected an integer >= 1 and <= 8192 or a list of 2 values"),
         ({"pixel_centers": "corner"}, "data.pixel_centers: expected one of half, integer"),
-        ({"limit": {"test": 3}}, "data.limit key: expected one of train, val"),
+        ({"limit": {"test": 3}}, "data.limit.test: expected one of train, val"),
         ({"limit": {"train": 0}}, "data.limit.train: expected an integer >= 1 or null"),
         ({"workers": -1}, "data.workers: expected an integer >= 0"),
     ],

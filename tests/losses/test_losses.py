@@ -269,7 +269,7 @@ def test_subsampled_chamfer_is_unbiased():
             {"weights": {"chamfer": 1.0}, "chamfer_points": 0},
             r"loss\.chamfer_points: expected an integer",
         ),
-        ({"weights": {"depth": 1.0}, "depth": "metres"}, r"loss key: .*'depth'"),
+        ({"weights": {"depth": 1.0}, "depth": "metres"}, r"loss.depth: .*'depth'"),
     ],
 )
 def test_impossible_values_name_their_key(arguments, key):

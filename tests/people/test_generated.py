@@ -129,8 +129,8 @@ def test_the_cache_is_named_after_every_setting(tmp_path):
         ),
         ({"people": {"train": 2, "val": 0}}, r"data\.people\.val: expected an integer >= 1 and .*; found 0"),
         ({"active": {"train": -1}}, r"data\.active\.train: expected an integer >= 0 and .*; found -1"),
-        ({"rig": {"hieght": 3}}, r"data\.rig key: expected one of .*; found 'hieght'"),
-        ({"rig": {"variation": {"colour": 3}}}, r"data\.rig\.variation key"),
+        ({"rig": {"hieght": 3}}, r"data\.rig\.hieght: expected one of .*; found 'hieght'"),
+        ({"rig": {"variation": {"colour": 3}}}, r"data\.rig\.variation\.colour: expected"),
     ],
 )
 def test_impossible_people_are_refused(tmp_path, changes, line):

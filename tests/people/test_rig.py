@@ -139,7 +139,7 @@ def test_what_varies_changes_nothing_else(tmp_path):
         ),
         ({"pitch": [-95, 0]}, r"pitch: expected a list of 2 values \(each a number > -89 and < 89\)"),
         ({"camera_roll": -1}, r"camera_roll: expected a number >= 0 and <= 180; found -1"),
-        ({"camera_rol": 1}, r"key: .*did you mean camera_roll"),
+        ({"camera_rol": 1}, r"camera_rol: .*did you mean camera_roll"),
     ],
 )
 def test_impossible_variations_are_refused(values, message):

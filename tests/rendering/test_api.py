@@ -22,7 +22,7 @@ from tests.helpers.splats import camera_ring, cloud
         (Renderer, {"background": "white"}, "renderer.background"),
         (Renderer, {"background": [0.0, float("inf"), 0.0]}, "renderer.background"),
         (Renderer, {"alpha_max": 1.0}, r"renderer\.alpha_max"),
-        (Renderer, {"alpha_mx": 0.9}, "renderer key: .*did you mean alpha_max"),
+        (Renderer, {"alpha_mx": 0.9}, "renderer.alpha_mx: .*did you mean alpha_max"),
         (RasterSettings, {"low_pass": -1.0}, "low_pass"),
         (RasterSettings, {"alpha_max": 1.0}, "alpha_max"),
         (RasterSettings, {"alpha_max": 0.003}, "alpha_max"),

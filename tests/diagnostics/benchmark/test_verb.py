@@ -12,7 +12,7 @@ from tests.helpers.verbs import ghgs
 
 KEYS = {"preset", "stage", "seconds", "seconds_low", "seconds_high", "psnr"}
 OF_TOTAL = {"peak_bytes", "flops", "max_rel_diff", "psnr_loss_db", "budget_db"}
-QUICK = ["timing.repeats=1", "threads=1", "metrics.lpips=off", "views=v3"]
+QUICK = ["timing.repeats=1", "metrics.lpips=off", "views=v3"]
 STAGES = [
     "bounds", "encoder.patch_tokens", "encoder", "depth_head", "unprojection", "recalibration",
     "gaussian_head", "render", "other", "total",

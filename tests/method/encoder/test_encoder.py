@@ -150,7 +150,7 @@ def test_normalisation_is_no_part_of_a_checkpoint():
         ({"vit": {"kind": "resnet"}}, "encoder.vit.kind: expected one of conv, stem, dinov2; found 'resnet'"),
         (
             {"vit": {"kind": "stem", "chanels": 8}},
-            "encoder.vit key: .*found 'chanels'",
+            "encoder.vit.chanels: .*found 'chanels'",
         ),
         ({"vit": {"kind": "stem"}}, "encoder.vit.channels: expected a number with kind=stem; found None"),
         ({"vit": {"kind": "conv", "heads": 2}}, "encoder.vit.heads: expected null with kind=conv; found 2"),

@@ -120,7 +120,7 @@ def test_the_branch_does_not_learn_and_the_rest_does():
         ({"heads": 3}, "encoder.semantic.width: expected a multiple of 4"),
         (
             {"chanels": 8},
-            "encoder.semantic key: expected one of channels, depth, heads, width; found 'chanels'",
+            "encoder.semantic.chanels: expected one of channels, depth, heads, width; found 'chanels'",
         ),
     ],
 )

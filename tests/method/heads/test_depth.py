@@ -133,7 +133,7 @@ def test_the_releases_parameterization_has_either_sign_and_no_bounds():
     ("options", "key"),
     [
         ({"parameterization": "linar"}, "depth_head.parameterization: expected one of bounded_inverse"),
-        ({"pixels": "all"}, "depth_head key: expected one of .*; found 'pixels'"),
+        ({"pixels": "all"}, "depth_head.pixels: expected one of .*; found 'pixels'"),
         ({"start": 1.0}, "depth_head.start"),
     ],
 )

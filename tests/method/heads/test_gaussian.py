@@ -170,7 +170,7 @@ def test_attributes_are_wide_under_autocast():
     ("options", "key"),
     [
         ({"parameterization": "ours"}, "gaussian_head.parameterization"),
-        ({"pixels": "all"}, "gaussian_head key: expected one of .*; found 'pixels'"),
+        ({"pixels": "all"}, "gaussian_head.pixels: expected one of .*; found 'pixels'"),
         ({"hidden": [32]}, "gaussian_head.hidden"),
         ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
         ({"attributes": {"thickness_start": 0.0}}, "gaussian_head.attributes.thickness_start"),

@@ -163,7 +163,7 @@ def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
         ({"k": 1.5}, "recalibration.k"),
         ({"similarity": "cosine"}, "recalibration.similarity: expected one of product"),
         ({"neighborhood": "feature"}, "recalibration.neighborhood: expected one of xyz, image_plane"),
-        ({"neighbors": "all"}, "recalibration key: expected one of .*found 'neighbors'"),
+        ({"neighbors": "all"}, "recalibration.neighbors: expected one of .*found 'neighbors'"),
         ({"tokens": "most"}, "recalibration.tokens"),
         ({"num_heads": 5}, "recalibration.num_heads"),
     ],
