@@ -21,8 +21,6 @@ from ghgs_lit.runs.run import RunDirectory
 COMPARED = ("psnr", "ssim", "depth_error_mm")
 #: Number of input views at which HParams compares runs that were measured with several numbers.
 _VIEWS = 4
-#: Groups of tags that TensorBoard shows first; it sorts groups by name, so others move to ``work/``.
-_FIRST = ("loss", "measured", "val", "view")
 #: Settings that are always logged as hyperparameters.
 _ALWAYS = ("seed", "views")
 Value = str | int | float | bool
@@ -72,16 +70,8 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log values without Lightning's epoch, and flush, so that a killed process loses none.
-
-        Args:
-            metrics: values by tag; tags of other groups than :data:`_FIRST` are prefixed with ``work/``.
-            step: Lightning's step."""
-        shown = {}
-        for name, value in metrics.items():
-            is_first = name.split("/")[0] in _FIRST
-            shown[name if is_first else f"work/{name}"] = value
-        shown.pop("work/epoch", None)
+        """Log values by tag without Lightning's epoch, and flush, so that a killed process loses none."""
+        shown = {name: value for name, value in metrics.items() if name != "epoch"}
         super().log_metrics(shown, step)
         self.experiment.flush()
 

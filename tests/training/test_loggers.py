@@ -88,17 +88,17 @@ def run(tmp_path_factory):
 
 
 def test_tags_are_those_that_the_documentation_lists(run):
-    """The tags are exactly those, in groups whose names sort losses and validations first; after eight
+    """The tags are exactly those, without the epoch; after eight
     steps, logged every second, and two validations only HParams has a single point."""
     found = events(run / "tensorboard")
     tags = set(found.Tags()["scalars"])
     groups = {tag.split("/")[0] for kind in ("scalars", "images", "histograms") for tag in found.Tags()[kind]}
-    assert groups == {"loss", "measured", "val", "view", "work"}
+    assert groups == {"loss", "measured", "train", "val", "view"}
     assert [tag for tag in tags if len(found.Scalars(tag)) < 2] == ["measured/psnr_v4_release"]
     assert tags == {
         "loss/total", "loss/render_l1", "loss/chamfer",
-        "work/train/budget", "work/train/gaussians", "work/train/gradient_norm", "work/train/learning_rate",
-        "work/train/skipped_steps",
+        "train/budget", "train/gaussians", "train/gradient_norm", "train/learning_rate",
+        "train/skipped_steps",
         "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "val/lpips",
         "measured/psnr_v4_release", "val/surface_mm", "val/psnr_box_40", "val/psnr_edge", "val/spill",
         "val/sharpness",
@@ -108,14 +108,12 @@ def test_tags_are_those_that_the_documentation_lists(run):
 def test_the_numbers_are_those_of_the_steps(run):
     """Values are logged at the number of steps taken."""
     found = events(run / "tensorboard")
-    rates = {e.step: e.value for e in found.Scalars("work/train/learning_rate")}
+    rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
     assert sorted(rates) == [2, 4, 6, 8]
     assert rates[8] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
-    assert [e.value for e in found.Scalars("work/train/budget")] == pytest.approx(
-        [1 / 8, 3 / 8, 5 / 8, 7 / 8]
-    )
+    assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
     # One subject in three views of 8 x 6 pixels.
-    assert {event.value for event in found.Scalars("work/train/gaussians")} == {144.0}
+    assert {event.value for event in found.Scalars("train/gaussians")} == {144.0}
     # Terms are logged unweighted, and the total is their weighted sum.
     terms = [found.Scalars(f"loss/{name}") for name in ("total", "render_l1", "chamfer")]
     for total, l1, chamfer in zip(*terms, strict=True):
@@ -169,8 +167,8 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
         rows = list(csv.DictReader(file))
     assert [float(row["a"]) for row in rows] == expected
     assert [row["b"] for row in rows] == ["", "1", "", "1", "", "1", "", ""]
-    assert steps_in_files(tmp_path / "tensorboard", "work/a") == list(range(1, 9))
-    scalars = events(tmp_path / "tensorboard").Scalars("work/a")
+    assert steps_in_files(tmp_path / "tensorboard", "a") == list(range(1, 9))
+    scalars = events(tmp_path / "tensorboard").Scalars("a")
     assert [(e.step, e.value) for e in scalars] == list(enumerate(expected, 1))
     assert [int(row["step"]) for row in rows] == list(range(1, 9))
 
