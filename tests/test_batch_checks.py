@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
-from ghgs_lit.execution.checks import findings_of, raise_violation
+from ghgs_lit.execution.preprocessing import findings_of, raise_violation
 from ghgs_lit.types import Batch
 from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch

@@ -17,8 +17,7 @@ from weakref import WeakSet
 import torch
 from torch import Tensor
 
-from ghgs_lit.execution.capture import CaptureBackend, CaptureChecks, CudaGraphs
-from ghgs_lit.execution.state import ModelState
+from ghgs_lit.execution.capture import CaptureBackend, CaptureChecks, CudaGraphs, ModelState
 from ghgs_lit.geometry.precision import rounding_state
 from ghgs_lit.rendering.capacity import Rooms, defer_checks
 

@@ -8,13 +8,17 @@ from typing import Any, NamedTuple
 import torch
 
 from ghgs_lit.errors import require_choice
-from ghgs_lit.execution.capture import NotCapturable
-from ghgs_lit.execution.checks import Finding, any_bad, raise_violation
+from ghgs_lit.execution.capture import ModelState, NotCapturable, state_of
 from ghgs_lit.execution.graphs import GraphCache, describe_inputs, retry_without_graphs
 from ghgs_lit.execution.options import ModelOptions
-from ghgs_lit.execution.preprocessing import Preprocessing, preprocess
-from ghgs_lit.execution.scene import Scene
-from ghgs_lit.execution.state import ModelState, state_of
+from ghgs_lit.execution.preprocessing import (
+    Finding,
+    Preprocessing,
+    Scene,
+    any_bad,
+    preprocess,
+    raise_violation,
+)
 from ghgs_lit.geometry.padding import PaddedBatch
 from ghgs_lit.geometry.precision import PRECISIONS, precision_of
 from ghgs_lit.method.model import GHGS

@@ -16,8 +16,7 @@ from torch.func import functional_call
 
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.execution.predictor import Predictor, Prepared
-from ghgs_lit.execution.preprocessing import Preprocessing
-from ghgs_lit.execution.scene import Scene
+from ghgs_lit.execution.preprocessing import Preprocessing, Scene
 from ghgs_lit.geometry.precision import precision_of
 from ghgs_lit.losses import Losses
 from ghgs_lit.method.plan import Sizes

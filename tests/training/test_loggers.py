@@ -88,8 +88,8 @@ def run(tmp_path_factory):
 
 
 def test_tags_are_those_that_the_documentation_lists(run):
-    """The tags are exactly those, without the epoch; after eight
-    steps, logged every second, and two validations only HParams has a single point."""
+    """The tags are exactly those, without the epoch; after eight steps, logged every second, and two
+    validations only HParams has a single point."""
     found = events(run / "tensorboard")
     tags = set(found.Tags()["scalars"])
     groups = {tag.split("/")[0] for kind in ("scalars", "images", "histograms") for tag in found.Tags()[kind]}
