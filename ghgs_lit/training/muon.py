@@ -47,6 +47,11 @@ def orthogonalize(matrices: Sequence[Tensor]) -> list[Tensor]:
     Returns:
         Matrices of the same sizes. Singular values below 1e-3 of a matrix's largest one become less
         than 1; zeros stay 0."""
+    # Divided by the largest value first, to prevent an underflow of squares.
+    for norm, least in ((torch.inf, torch.finfo(matrices[0].dtype).tiny), (2, 1.0)):
+        norms = torch._foreach_norm(matrices, norm)
+        torch._foreach_clamp_min_(norms, least)
+        matrices = torch._foreach_div(matrices, norms)
     wide = [matrix if matrix.shape[0] <= matrix.shape[1] else matrix.mT for matrix in matrices]
     by_shape: dict[torch.Size, list[int]] = {}
     for number, matrix in enumerate(wide):
@@ -59,12 +64,9 @@ def orthogonalize(matrices: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _orthogonalize_stack(matrices: Tensor) -> Tensor:
-    """Orthogonalise matrices [n, R, C] with R <= C by polynomials of their Gram matrices."""
+    """Orthogonalise matrices [n, R, C] with R <= C and norms of at most 1 by polynomials of their Gram
+    matrices."""
     a, b, c = COEFFICIENTS
-    largest = torch.linalg.vector_norm(matrices, torch.inf, dim=(1, 2), keepdim=True)
-    # Prevents an underflow of squares.
-    matrices = matrices / largest.clamp(min=torch.finfo(matrices.dtype).tiny)
-    matrices = matrices / torch.linalg.vector_norm(matrices, dim=(1, 2), keepdim=True).clamp(min=1)
     for _ in range(ITERATIONS):
         gram = matrices @ matrices.mT
         matrices = torch.baddbmm(matrices, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), matrices, beta=a)
