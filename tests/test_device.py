@@ -12,7 +12,6 @@ from torch.utils.data import DataLoader
 from benchmarks import device as device_counts
 from ghgs_capture.verbs import predict
 from ghgs_lit.config import conf_dir
-from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.execution import Predictor
@@ -156,8 +155,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         def build():
             return Predictor(make_model("model=paper").to(device).eval())
 
-        per_scene = PerScene(steps=1)
-        methods = {name: baseline(name, REFERENCE, build, per_scene) for name in BASELINES}
+        methods = {name: baseline(name, REFERENCE, build, 1) for name in BASELINES}
         methods["model"] = ModelMethod(build(), REFERENCE)
         methods["refined"] = ModelMethod(build(), REFERENCE, Refinement(1, REFERENCE))
         refined = build()
