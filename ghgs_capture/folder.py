@@ -18,7 +18,7 @@ from ghgs_capture.frames import Source, VideoFrame, find_frames, has_videos
 from ghgs_capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_capture.photographs import (
     Pixels,
-    composed_names,
+    compose_names,
     find_image,
     find_instants,
     fits_stored,
@@ -95,7 +95,7 @@ class CaptureFolder:
         folder = self.images
         cameras = self.file.cameras
         part = self.sequence
-        names = composed_names(self.calibration.names)
+        names = compose_names(self.calibration.names)
         if has_videos(folder, cameras, names):
             return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)

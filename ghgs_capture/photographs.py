@@ -83,7 +83,7 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
     return size is not None and same_ratio(size, pixels.stored_size) and not same_ratio(size, pixels.size)
 
 
-def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
+def compose_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
     """Convert ``calibration.names`` (cameras by photograph) to text in Unicode's composed form.
 
     Args:

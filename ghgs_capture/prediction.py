@@ -281,10 +281,10 @@ def without_tones(capture: Capture, tones: Mapping[str, float]) -> Capture:
     """
     if not tones:
         return capture
-    photographs = (_without(one, tones.get(one.name, 1.0)) for one in capture.photographs)
+    photographs = (_undo_gamma(one, tones.get(one.name, 1.0)) for one in capture.photographs)
     return replace(capture, photographs=tuple(photographs))
 
 
-def _without(photograph: Photograph, gamma: float) -> Photograph:
+def _undo_gamma(photograph: Photograph, gamma: float) -> Photograph:
     levels = np.round(255 * (np.arange(256) / 255) ** (1 / gamma)).astype(np.uint8)
     return replace(photograph, image=levels[photograph.image])

@@ -53,9 +53,9 @@ class Rig:
         Args:
             capture: capture of this rig with uncorrected cameras; those that the rig lacks are kept.
         """
-        return replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
+        return replace(capture, photographs=tuple(map(self._correct, capture.photographs)))
 
-    def _corrected(self, photograph: Photograph) -> Photograph:
+    def _correct(self, photograph: Photograph) -> Photograph:
         """Correct one camera; a camera that most instants lack is unchanged."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
         zoom = self.zoom.get(photograph.name, 1.0)
