@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # importing Lightning takes seconds
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
 #: Keys of ``data`` that describe the training machine rather than the data.
-OF_MACHINE = ("cache_dir", "packed_gb", "render_workers", "workers")
+OF_MACHINE = ("cache_dir", "packed", "render_workers", "workers")
 
 #: Keys that may change in a trained model: they affect neither shape nor meaning of any tensor.
 FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "rounds.height", "skip", "unprojection")

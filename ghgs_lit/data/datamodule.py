@@ -164,26 +164,24 @@ class PhotographsDataModule(LightningDataModule):
         return TrainingBatches(*parts, length, self.trains_on_depths, rank, world)
 
     def _use_packs(self, batches: float, rank: int) -> None:
-        """Read training images from packed files if these fit on the disk. Missing files are written only
-        if the run loads more images than there are."""
+        """Read training images from packed files. Missing files are written only if the run loads more
+        images than there are."""
         data = self.dataset
         photographs = self.photographs("train")
-        subjects = self.subjects("train")
-        if data.packed_gb <= 0 or not subjects:
+        if not data.packed:
             return
         drawn = batches * data.batch_size * (max(self.views.training_counts) + self.targets.per_step)
         views = tuple(sorted({RING_VIEW, *self.targets.training_views}))
-        writes = drawn > sum(map(len, subjects.values())) * len(views)
+        writes = drawn > sum(map(len, photographs.reader.subjects.values())) * len(views)
+        folder = choose_folder(data.folder)
+        if writes and rank == 0:
+            log.info("photographs of training are packed in %s (data.packed=false: not)", folder)
         # With varying sizes images are resized in each step, so they are packed at their stored size.
         varies = self.augmentation.varies_sizes
-        sizes = (None,) if varies else dict.fromkeys((photographs.size, photographs.target_size))
-        packs = {}
-        for size in sizes:
+        for size in {None} if varies else {photographs.size, photographs.target_size}:
             depths = self.trains_on_depths and size in (None, photographs.size)
-            options = (choose_folder(data.folder), size, data.resampling, views, depths, writes)
-            packs[size] = Packs(photographs.reader, *options)
-        announce = log.info if rank == 0 else log.debug
-        photographs.packs = {size: each for size, each in packs.items() if each.fit(data.packed_gb, announce)}
+            options = (folder, size, data.resampling, views, depths, writes)
+            photographs.packs[size] = Packs(photographs.reader, *options)
 
     def train_dataloader(self) -> DataLoader:
         """Loader of one epoch, which continues where the last one ended."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.options import Amount, Count, Index, Options, PathText, Size, Text, Workers
+from ghgs_lit.config.options import Count, Index, Options, PathText, Size, Text, Workers
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
 from ghgs_lit.errors import InputError
@@ -71,9 +71,9 @@ class DataOptions(Options):
     """Samples of a step in each process, all in memory at once; at most 1024."""
     steps_per_epoch: Count | None = None
     """Training steps of an epoch; null: whole passes over the subjects, at least 100 steps."""
-    packed_gb: Amount = 16
-    """Maximum size in GB (10^9 bytes) of decoded training images on disk, in the data's folder or the
-    user's cache, from which they are memory-mapped; 0: none."""
+    packed: bool = True
+    """Whether decoded training images are stored in the data's folder or the user's cache, and
+    memory-mapped from there; a tenth of the disk stays free."""
     evaluation_positions: tuple[tuple[Index, ...], ...] = ()
     """Lists of input positions for evaluation, such as [[0, 6, 11]] for 3 views; other numbers of views
     are evenly spaced."""

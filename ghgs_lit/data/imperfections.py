@@ -198,13 +198,12 @@ def perturb_cameras(
         corners, distances[:, None].expand(-1, 4), _repeat_for_corners(lenses), _repeat_for_corners(poses)
     )
 
-    def project_corners(lens: Tensor, pose: Tensor) -> Tensor:
-        """Projections of the corners; far from the world's origin even those of the true cameras differ
-        from ``corners`` by rounding."""
-        return project(points, _repeat_for_corners(lens), _repeat_for_corners(pose))[0]
+    # Far from the world's origin these differ from ``corners`` by rounding.
+    true = project(points, _repeat_for_corners(lenses), _repeat_for_corners(poses))[0]
 
     def measure_error(lens: Tensor, pose: Tensor) -> Tensor:
-        return (project_corners(lens, pose) - project_corners(lenses, poses)).square().sum(-1).mean(-1).sqrt()
+        moved = project(points, _repeat_for_corners(lens), _repeat_for_corners(pose))[0]
+        return (moved - true).square().sum(-1).mean(-1).sqrt()
 
     errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
     for _ in range(3):  # converges fast, as the size is nearly proportional to the errors

@@ -2,14 +2,12 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
 
 import numpy as np
 
 from ghgs_lit.data.view import View, area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
-_T = TypeVar("_T")
 # Longer side of a coarse mask in cells.
 _CELLS = 64
 #: Comparison of masks; a quarter of them may be wrong.
@@ -53,7 +51,7 @@ def measure_height(silhouettes: Sequence[Silhouette]) -> float:
     return float(np.median([s.extent(focus)[0] for s in silhouettes]))
 
 
-def find_equal_poses(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
+def find_equal_poses(poses: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
     """Names of the first two equal poses among [4, 4] poses by name; None if all differ."""
     pairs = itertools.combinations(poses, 2)
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)

@@ -9,6 +9,7 @@ again, and if two processes write the same file, either result is valid.
 """
 
 import contextlib
+import errno
 import functools
 import glob
 import hashlib
@@ -17,7 +18,6 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,8 +37,8 @@ log = logging.getLogger(__name__)
 _VERSION = 2
 #: Number of files that a process keeps open.
 _OPEN_FILES = 128
-#: Maximum share of the free disk space that packed files may take.
-_SHARE_OF_DISK = 0.5
+#: Share of the disk that packed files leave free.
+_KEPT_FREE = 0.1
 #: Arrays of a view of which only the part that is not black is stored, and arrays stored whole.
 _MAPS = ("image", "mask", "matte", "inverse_depth")
 _CAMERA = ("intrinsics", "extrinsics")
@@ -75,16 +75,11 @@ class Packs:
 
     def view(self, name: str, position: int, view: int, depth: bool) -> View | None:
         """Read a packed view, at the size of the packed files; arguments as for
-        :meth:`Reader.read_checked_view`.
+        :meth:`Reader.read_checked_view`. The file of the subject is written if it is missing.
 
         Returns:
             The view; None: it is not packed, or is packed without the requested depth map.
         """
-        pack = self.pack(name)
-        return None if pack is None or depth > self.depths else pack.view(position, view, depth)
-
-    def pack(self, name: str) -> "Pack | None":
-        """Open the packed file of a subject, and write it if it is missing; None: there is none."""
         if name not in self.paths:
             self.paths[name] = self._path(name)
         path = self.paths[name]
@@ -96,7 +91,7 @@ class Packs:
             pack = _try_open(path)
         if pack is None:  # do not try again
             self.paths[name] = None
-        return pack
+        return None if pack is None or depth > self.depths else pack.view(position, view, depth)
 
     def _path(self, name: str) -> Path | None:
         """Path of a subject's file, named after the names, sizes and times of its sources; None: unknown
@@ -119,6 +114,10 @@ class Packs:
                 stored = self.reader.read_checked_view(name, position, view, self.depths)
                 content |= _pack_view(position, view, resize_view(stored, self.size, self.resampling))
         try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            disk = shutil.disk_usage(self.folder)
+            if disk.free < _KEPT_FREE * disk.total:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             write_atomically(path, lambda temporary: temporary.write_bytes(save(content)))
             for other in self.folder.glob(f"{glob.escape(name)}-{self.digest}-*.safetensors"):
                 if other != path:
@@ -127,34 +126,11 @@ class Packs:
             self.writes = False
             log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
 
-    def fit(self, most_gb: float, announce: Callable[[str], None]) -> bool:
-        """Whether the files of all subjects fit within the limit and the free disk space.
-
-        Args:
-            most_gb: maximum size of all files in GB (10^9 bytes).
-            announce: called with a line about their size and folder, or the reason for packing nothing.
-        """
-        names = list(self.reader.subjects)
-        pack = self.pack(names[0])
-        if pack is None:
-            return False
-        stored = sum(file.stat().st_size for file in self.folder.glob(f"*-{self.digest}-*.safetensors"))
-        whole = max(pack.bytes * len(names), stored)
-        free = shutil.disk_usage(self.folder).free
-        size = f"about {whole / 1e9:.2g} GB for {len(names)} subjects in {self.folder}"
-        if whole > most_gb * 1e9 or whole - stored > _SHARE_OF_DISK * free:
-            reason = f"{size} (data.packed_gb={most_gb:g}, {free / 1e9:.0f} GB are free)"
-            announce(f"photographs are not packed: {reason}")
-            return False
-        announce(f"photographs of training are packed: {size} (data.packed_gb=0: none)")
-        return True
-
 
 class Pack:
-    """Reader of the packed images of one subject, in the file ``path`` of ``bytes`` bytes."""
+    """Reader of the packed images of one subject, in the file ``path``."""
 
     def __init__(self, path: Path) -> None:
-        self.bytes = path.stat().st_size
         self._file = safe_open(path, "np")
         self._names = frozenset(self._file.keys())
 

@@ -6,7 +6,7 @@ A data set implements a :class:`Reader`, which finds and decodes its files. Resi
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -155,7 +155,7 @@ class Photographs:
         self.size = size
         self.target_size = target_size or size
         self.resampling = resampling
-        self.packs: Mapping[Size | None, Packs] = {}
+        self.packs: dict[Size | None, Packs] = {}
 
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: Size | None = None

@@ -1,10 +1,10 @@
 """Packed files: samples equal those of the original files, whatever happens to either."""
 
-import logging
 import multiprocessing
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,9 +31,9 @@ def root(boxes, tmp_path) -> Path:
     return shutil.copytree(boxes, tmp_path / "out")
 
 
-def batches(root, gb=1, **options):
+def batches(root, packed=True, **options):
     """Batches of the first steps of a training."""
-    data = rendered(root, packed_gb=gb, **{"steps_per_epoch": 4, "batch_size": 2, "workers": 0, **options})
+    data = rendered(root, packed=packed, **{"steps_per_epoch": 4, "batch_size": 2, "workers": 0, **options})
     return list(data.train_dataloader())
 
 
@@ -43,7 +43,7 @@ def files(root) -> list[Path]:
 
 def same(root, **options) -> bool:
     """Whether batches from packed files equal those from the original files, bit for bit."""
-    return all(map(equal, batches(root, **options), batches(root, gb=0, **options)))
+    return all(map(equal, batches(root, **options), batches(root, packed=False, **options)))
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_samples_come_from_the_packed_files(root):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ghgs_lit.data.layout.read_photograph", refuse)
         with pytest.raises(AssertionError):
-            batches(root, gb=0)
+            batches(root, packed=False)
         assert all(map(equal, batches(root), expected))
     assert [path.stat().st_mtime_ns for path in files(root)] == times
 
@@ -100,7 +100,7 @@ def test_changed_data_is_never_read_from_an_old_file(root, kind):
             Image.fromarray(values - values // 4).save(path)
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     after = batches(root)
-    assert all(map(equal, after, batches(root, gb=0)))
+    assert all(map(equal, after, batches(root, packed=False)))
     assert not any(map(equal, after, before))
     assert len(files(root)) == 2  # outdated files were deleted
 
@@ -157,29 +157,25 @@ def test_depth_maps_that_are_not_packed_are_read_from_the_folder(root):
 
 
 def test_packing_can_be_switched_off(root):
-    batches(root, gb=0)
+    batches(root, packed=False)
     assert not files(root)
 
 
-def test_what_would_not_fit_is_not_packed(root, caplog):
-    """Above packed_gb, or half of the free disk space, the original files are read, and a line is logged."""
-    with caplog.at_level(logging.INFO):
-        assert all(map(equal, batches(root, gb=1e-9), batches(root, gb=0)))
-    assert "photographs are not packed: about" in caplog.text
-    assert len(files(root)) == 1  # of the first subject, from which the size is estimated
-
-
-def test_a_full_disk_stops_no_training(root, caplog, monkeypatch):
-    """If files cannot be written, the original ones are read, with a single warning."""
+@pytest.mark.parametrize("free", [0, 50])
+def test_a_full_disk_stops_no_training(root, caplog, monkeypatch, free):
+    """If files cannot be written or less than a tenth of the disk is free, the original ones are read, with
+    a single warning."""
     batches(root)
     files(root)[1].unlink()
 
     def full(path, write):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(packed, "write_atomically", full)
+    monkeypatch.setattr(packed, "write_atomically", packed.write_atomically if free == 0 else full)
+    monkeypatch.setattr(packed.shutil, "disk_usage", lambda _: SimpleNamespace(total=100, free=free))
     packed._open.cache_clear()
     assert same(root)
+    assert len(files(root)) == 1
     assert sum("found No space left on device" in record.message for record in caplog.records) == 1
 
 

@@ -88,7 +88,7 @@ def test_what_does_not_learn_needs_weights(tmp_path):
 def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
     """Settings of folders and processes are taken from the command line, never from a checkpoint, which may
     come from another machine."""
-    machine = {"cache_dir": str(tmp_path / "theirs"), "workers": 1024, "packed_gb": 1e9}
+    machine = {"cache_dir": str(tmp_path / "theirs"), "workers": 1024, "packed": False}
     data = {"name": "synthetic", "size": 56}
     path = checkpoint(
         tmp_path / "a.ckpt", Other(), config={"data": {**data, **machine, "render_workers": 64}}
