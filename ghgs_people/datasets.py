@@ -153,7 +153,7 @@ class Synthetic(_Renderable):
 
 
 class Scans(DataSet, _Renderable):
-    """Scans, rendered from ``source`` into ``root`` by :meth:`render_missing`."""
+    """Scans, rendered from ``source`` into ``root`` by :meth:`make`."""
 
     name: Text = "scans"
     size: Size = 140
@@ -194,13 +194,7 @@ class Scans(DataSet, _Renderable):
         return ScanSource(self.source_folder)
 
     def make(self) -> None:
-        self.render_missing()
-
-    def render_missing(self) -> int:
         """Render the scans of the split (up to ``limit``) that are missing in ``root``.
-
-        Returns:
-            Number of newly rendered scans.
 
         Raises:
             InputError: ``source`` or ``root`` is null, a scan is invalid, or ``root`` contains other data.
@@ -209,9 +203,7 @@ class Scans(DataSet, _Renderable):
         root = required_folder("data.root", "a folder", self.root)
         names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)
         names = {phase: listed[: self.limit.of(phase)] for phase, listed in names.items()}
-        rig = self.rig.build()
-        workers = self.render_workers
-        return render_people(root, names, source, rig, self.render, _SEED, workers)
+        render_people(root, names, source, self.rig.build(), self.render, _SEED, self.render_workers)
 
 
 @functools.cache

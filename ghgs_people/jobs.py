@@ -1,7 +1,7 @@
 """Render many people in several processes: resumable, and reproducible for the same seed.
 
 Workers are spawned (forking a process with threads may hang): each imports the script that called
-:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to workspaces;
+:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. They write to workspaces;
 the process that holds the lock moves finished subjects to their place (:mod:`ghgs_lit.data.layout`). In
 addition to the files described there, ``<root>/rendering/`` contains ``settings.json`` (the settings of
 the files), ``lock`` and ``tmp/`` (workspaces)."""
@@ -13,18 +13,18 @@ import multiprocessing
 import os
 import shutil
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 from unittest import mock
 
 import numpy as np
 import torch
+from PIL import Image
 from pydantic import Field
 from rich.console import Console
 from rich.progress import track
@@ -44,37 +44,20 @@ from ghgs_people.figures.mesh import Person
 from ghgs_people.lights import Lights
 from ghgs_people.photograph import Studio
 from ghgs_people.rig import STILL, Rig
-from ghgs_people.writing import write_body, write_view
+from ghgs_people.scans import ScanSource
 
 log = logging.getLogger(__name__)
 
-_GUARD = 'if __name__ == "__main__":'
 # Part of every cache key; increase it when the same settings yield other photographs
 RENDER_VERSION = 3
 #: One thread per worker, since the threads of NumPy's matrix products wait by spinning
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 #: Folders of a subject's files, in the order in which they are moved to their place
 _KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
+# zlib's Z_RLE: half the time of the default, with files no larger
+_PNG = {"compress_type": 3}
 #: Distribution of the lights of all people
 LIGHTS = Lights()
-
-
-class PersonSource(Protocol):
-    """Loader of people; must be picklable."""
-
-    def load(self, name: str) -> Person:
-        """Read or generate a person.
-
-        Raises:
-            InputError: the person's data is invalid.
-        """
-
-    def facing(self, name: str) -> float:
-        """Direction that a person faces.
-
-        Returns:
-            Degrees by which the first camera is turned about y to face the person.
-        """
 
 
 #: First letter of the names of generated people in poses of sport and dance
@@ -96,6 +79,10 @@ class SyntheticSource:
 
     def facing(self, name: str) -> float:
         return 0.0
+
+
+#: Loaders of people; picklable.
+PersonSource = SyntheticSource | ScanSource
 
 
 class RenderOptions(Options):
@@ -189,6 +176,46 @@ def _render(
         write_body(workspace, name, person.body_vertices)
 
 
+def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
+    """Write one view of a subject.
+
+    The JPEG has full chroma resolution. The mask has three equal channels, of which the authors' loader
+    reads the first.
+
+    Args:
+        phase: folder of the phase, or a workspace.
+        folder: name of the subject's position, ``<id>_<position>``.
+        number: number of the view at its position.
+        view: image, mask and camera; matte and inverse depth are optional.
+        quality: quality of the JPEG, 1 to 100.
+    """
+    folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
+    for path in folders.values():
+        path.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
+    mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
+    Image.fromarray(mask).save(folders["mask"] / f"{number}.png", **_PNG)
+    if view.matte is not None:
+        Image.fromarray(view.matte).save(folders["alpha"] / f"{number}.png", **_PNG)
+    if view.inverse_depth is not None:
+        Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png", **_PNG)
+    np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))
+    np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
+
+
+def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
+    """Write the vertices of a subject's body.
+
+    Args:
+        phase: folder of the phase, or a workspace.
+        name: name of the subject.
+        vertices: [n, 3], metres.
+    """
+    folder = phase / "smpl" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "vertices.npy", vertices.astype(np.float32))
+
+
 def render_people(
     root: Path,
     names: Mapping[str, Sequence[str]],
@@ -197,7 +224,6 @@ def render_people(
     settings: RenderOptions,
     seed: int,
     workers: int | None = None,
-    shown: bool = True,
 ) -> int:
     """Render people into ``root``; existing ones are kept.
 
@@ -211,22 +237,15 @@ def render_people(
         settings: renderings of each person.
         seed: seed of heights, yaws and lights.
         workers: number of processes; None: one per core; 0: only this one.
-        shown: show a progress bar.
 
     Returns:
         Number of newly rendered people.
 
     Raises:
-        InputError: ``root`` contains other data, a position is not on the rig, the script has no main
-            guard, or people are invalid (raised after all others are rendered).
+        InputError: ``root`` contains other data, a position is not on the rig, or people are invalid
+            (raised after all others are rendered).
         RuntimeError: a rendering process died.
     """
-    # A worker that imports a script without a main guard would wait for its parent forever.
-    expected = (
-        f"`{_GUARD}` around what a script does (rendering processes import it), or data.render_workers=0"
-    )
-    is_imported = getattr(multiprocessing.current_process(), "_inheriting", False)
-    require(not is_imported, sys.argv[0], expected, None)
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
@@ -247,7 +266,7 @@ def render_people(
         render = functools.partial(render_person, source, rig, settings, seed)
         folders = [workspaces / f"{phase}-{name}" for phase, name in todo]
         results = _map(render, folders, [name for _, name in todo], workers)
-        progress = {"total": len(todo), "console": Console(stderr=True), "disable": not shown}
+        progress = {"total": len(todo), "console": Console(stderr=True)}
         bad = []
         try:
             for index, why in track(results, f"rendering into {root}", **progress):
@@ -292,10 +311,9 @@ def check_settings(notes: Completeness, settings: dict) -> None:
 
 def _request(notes: Completeness, names: Mapping[str, Sequence[str]]) -> None:
     """Store the names of requested subjects by phase."""
-    known = notes.plan
-    plan = {}
-    for phase in known.keys() | names.keys():
-        plan[phase] = sorted({*known.get(phase, []), *names.get(phase, [])})
+    plan = notes.plan
+    for phase, listed in names.items():
+        plan[phase] = sorted({*plan.get(phase, []), *listed})
     write_text_atomically(notes.folder / "plan.json", json.dumps(plan, indent=1))
 
 
@@ -335,9 +353,7 @@ def _map(
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
-            raise RuntimeError(
-                f"a rendering process died: the script lacks `{_GUARD}`, or memory ran out (repeat to go on)"
-            ) from error
+            raise RuntimeError("a rendering process died: memory ran out? (repeat to go on)") from error
         finally:
             pool.shutdown(cancel_futures=True)
 

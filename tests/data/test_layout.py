@@ -13,8 +13,8 @@ from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.data.view import View, encode_depth
+from ghgs_people.jobs import write_body, write_view
 from ghgs_people.photograph import Studio
-from ghgs_people.writing import write_body, write_view
 from tests.helpers.captures import points_of, refused, truncate
 from tests.helpers.people import RIG, box_person
 
