@@ -13,7 +13,7 @@ from PIL import Image
 
 from ghgs_capture.calibration import same_ratio
 from ghgs_capture.photographs import MASK_ENDING, Pixels, find_image, find_similar_mask, read_pixels
-from ghgs_lit.data.images import read_image
+from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import import_optional, require, require_choice
 
 SEGMENTERS = ("rembg",)  #: Choices of ``segment``

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ghgs_capture.calibration import StoredCamera, same_ratio
-from ghgs_lit.data.images import orientation_of, read_image, rgb_of
+from ghgs_lit.data.decoding import orientation_of, read_image, rgb_of
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import find_path, normalize_name
 

@@ -13,10 +13,9 @@ from pydantic import Field
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Options, Share, Size, Text, Workers
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
-from ghgs_lit.data.layout import Rendered
+from ghgs_lit.data.layout import Rendered, read_split, split_names
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
-from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_people import bench, figures
 from ghgs_people.jobs import (

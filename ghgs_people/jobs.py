@@ -156,7 +156,7 @@ def _render(
     lights = LIGHTS.draw(rng)
     height, width = settings.size
     # A separate generator, so that heights, yaws and lights do not depend on variations.
-    rig, poses = rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
+    rig, poses = rig.vary(person, yaws, width / height, rng.spawn(1)[0])
     studio = Studio(person, None if settings.lights == "none" else lights, settings.samples)
     for position in range(len(yaws)) if settings.positions is None else settings.positions:
         index = (position, list(settings.views))

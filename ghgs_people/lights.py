@@ -108,11 +108,7 @@ class LightRig:
         Args:
             brightness: mean brightness of the subject at an exposure of 1.
         """
-        return (
-            self
-            if self.exposure
-            else replace(self, exposure=self.brightness / np.sqrt(_TYPICAL * brightness))
-        )
+        return replace(self, exposure=self.exposure or self.brightness / np.sqrt(_TYPICAL * brightness))
 
     def shade(
         self,

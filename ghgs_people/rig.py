@@ -75,18 +75,6 @@ class RigOptions(Options):
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Deviations of cameras [...] from their ring: pitch and roll in degrees, shift [..., 3] in metres."""
-
-    pitch: np.ndarray | float = 0.0
-    roll: np.ndarray | float = 0.0
-    shift: np.ndarray | float = 0.0
-
-    def __getitem__(self, index) -> "Poses":
-        return Poses(self.pitch[index], self.roll[index], self.shift[index])
-
-
-@dataclass(frozen=True)
 class Rig:
     """A ring of cameras, by default that of the published scripts."""
 
@@ -119,22 +107,22 @@ class Rig:
         offsets = np.stack((0 * first, 0 * first + 1, first, 0 * first + 0.5, 0.5 + second), -1)
         return start[:, None] + step * offsets
 
-    def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
+    def cameras(self, yaws: np.ndarray, height: int, width: int, poses: np.ndarray | None = None) -> Cameras:
         """Create cameras of the ring.
 
         Args:
             yaws: degrees about y, any shape; 0 sees the front of a subject that faces +z.
             height: height of the images, pixels.
             width: width of the images, pixels.
-            poses: deviations of the cameras, in the shape of ``yaws``; None: none.
+            poses: deviations [..., 5] of the cameras: pitch and roll in degrees, shift along three axes in
+                metres; None: none.
 
         Returns:
             Cameras in the shape of ``yaws``, float32, metres.
         """
-        poses = poses or Poses()
+        poses = np.zeros((*np.shape(yaws), 5)) if poses is None else poses
         yaw, pitch, roll = (
-            np.broadcast_to(np.radians(angle), np.shape(yaws))[..., None]
-            for angle in (yaws, self.pitch + poses.pitch, poses.roll)
+            np.radians(angle)[..., None] for angle in (yaws, self.pitch + poses[..., 0], poses[..., 1])
         )
         backward = np.concatenate(
             (np.cos(pitch) * np.sin(yaw), -np.sin(pitch), np.cos(pitch) * np.cos(yaw)), -1
@@ -144,7 +132,7 @@ class Rig:
         right = np.cos(roll) * level + np.sin(roll) * down
         down = np.cos(roll) * down - np.sin(roll) * level
         rotation = np.stack((right, down, -backward), -2)
-        center = np.asarray(self.look_at) + poses.shift + self.radius * backward
+        center = np.asarray(self.look_at) + poses[..., 2:] + self.radius * backward
         extrinsics = np.zeros((*np.shape(yaws), 4, 4))
         extrinsics[..., :3, :3] = rotation
         extrinsics[..., :3, 3] = -(rotation @ center[..., None])[..., 0]
@@ -156,9 +144,9 @@ class Rig:
         extrinsics = extrinsics.astype(np.float32)
         return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(extrinsics), height, width)
 
-    def drawn(
+    def vary(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
-    ) -> tuple["Rig", Poses]:
+    ) -> tuple["Rig", np.ndarray]:
         """Sample the rig of one subject and the deviations of its cameras from ``variation``.
 
         Args:
@@ -168,7 +156,7 @@ class Rig:
             rng: used only for the rig; samples the same numbers for every ``variation``.
 
         Returns:
-            The rig without variation, and the deviations [positions, 5] of its cameras.
+            The rig without variation, and the deviations [positions, 5, 5] of its cameras (:meth:`cameras`).
 
         Raises:
             InputError: ``fill`` varies and a point of the subject is behind a camera.
@@ -177,14 +165,11 @@ class Rig:
         share = rng.uniform(size=3)
         deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
         deviations[:, 1] = np.roll(deviations[:, 0], -1, 0)  # view 1 is the next ring camera
-        pitch = deviations[..., 0]
-        roll = deviations[..., 1]
-        shift = deviations[..., 2:]
         # sampled last, so that the numbers above do not change
         higher = rng.uniform(-1, 1, yaws.shape)
         higher[:, :2] = 0
-        pitch = v.camera_pitch * pitch + v.between_pitch * higher
-        poses = Poses(pitch, v.camera_roll * roll, v.camera_look_at * shift)
+        poses = deviations * np.array([v.camera_pitch, v.camera_roll, *[v.camera_look_at] * 3])
+        poses[..., 0] += v.between_pitch * higher
         radius = _within(v.radius, share[0], self.radius)
         ring_pitch = _within(v.pitch, share[1], self.pitch)
         rig = replace(self, radius=radius, pitch=ring_pitch, variation=STILL)
@@ -197,7 +182,7 @@ class Rig:
         tallest = (high - low)[:, 1].max()
         return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
 
-    def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    def _extents(self, person: Person, yaws: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest (x/z, y/z) [n, 2] of a placed subject in n cameras."""
         vertices = np.concatenate([part.vertices for part in person.parts])
         low = []

@@ -12,8 +12,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from ghgs_lit.data.decoding import check_extent, read_vertices
-from ghgs_lit.data.images import limit_formats, read_image
+from ghgs_lit.data.decoding import check_extent, limit_formats, read_image, read_vertices
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import find_path, require_folder, split_path
 from ghgs_people.figures.mesh import Person, TexturedMesh

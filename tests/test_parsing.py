@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
 
-from ghgs_lit.data.decoding import read_array
-from ghgs_lit.data.images import read_image
+from ghgs_lit.data.decoding import read_array, read_image
 from ghgs_lit.data.layout import Completeness
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.errors import InputError

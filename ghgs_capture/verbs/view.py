@@ -22,7 +22,7 @@ from ghgs_capture.calibration import calibrate
 from ghgs_capture.export.subject import AXES, smooth
 from ghgs_capture.formats.matrices import read_matrices
 from ghgs_lit.cli.runtime import output_dir, write_config
-from ghgs_lit.data.images import read_image
+from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import InputError, import_optional, require
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.ply import read_ply

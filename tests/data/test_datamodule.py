@@ -16,7 +16,7 @@ import torch
 from ghgs_lit.data.batches import choose_workers, make_loader
 from ghgs_lit.data.datamodule import count_trained_batches
 from ghgs_lit.data.humman import HuMMan
-from ghgs_lit.data.splits import read_split, split_names
+from ghgs_lit.data.layout import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_people.datasets import Scans, Synthetic
 from tests.helpers.captures import refused

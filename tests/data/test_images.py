@@ -8,8 +8,14 @@ import pytest
 from PIL import EpsImagePlugin, ExifTags, Image
 
 from ghgs_capture.photographs import read_pixels
-from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics, read_map, read_photograph
-from ghgs_lit.data.images import limit_formats, read_image
+from ghgs_lit.data.decoding import (
+    check_extrinsics,
+    check_intrinsics,
+    limit_formats,
+    read_image,
+    read_map,
+    read_photograph,
+)
 from ghgs_lit.data.reader import Photographs, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError

@@ -26,7 +26,7 @@ def drawn(rig, person, aspect=1.0, seed=0):
     """A subject's rig, its cameras [16, 5] of 100 rows, and the yaws."""
     rng = subject_rng(seed, person.name)
     yaws = rig.yaws(rng)
-    own, poses = rig.drawn(person, yaws, aspect, rng)
+    own, poses = rig.vary(person, yaws, aspect, rng)
     return own, own.cameras(yaws, 100, round(100 * aspect), poses), yaws
 
 
