@@ -11,8 +11,8 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Options, Share, Size, Text, Workers
-from ghgs_lit.data.dataset import DataSet, Limit, required_folder
+from ghgs_lit.config.options import Options, Size, Text, Workers
+from ghgs_lit.data.dataset import DataSet, required_folder
 from ghgs_lit.data.layout import Rendered, read_split, split_names
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
@@ -79,7 +79,6 @@ class ActivePeople(Options):
 class Synthetic(_Renderable):
     """Generated people, rendered on first use into a cache folder named after all their settings."""
 
-    limit: ClassVar[Limit] = Limit()
     pixel_centers: ClassVar[str] = "half"
 
     name: Text = "synthetic"
@@ -154,6 +153,9 @@ class Synthetic(_Renderable):
 class Scans(DataSet, _Renderable):
     """Scans, rendered from ``source`` into ``root`` by :meth:`make`."""
 
+    #: Fraction of the scans, at least one, for val if no split is given.
+    val_fraction: ClassVar[float] = 0.1
+
     name: Text = "scans"
     size: Size = 140
     render: RenderOptions = RenderOptions(lights="none")
@@ -162,9 +164,7 @@ class Scans(DataSet, _Renderable):
     split: options.PathText | dict[str, tuple[Text, ...] | None] | None = None
     """Subjects of train and val: a folder with split_train.txt and split_val.txt, or {train: [0000-0425],
     val: [0426-0525]}. null: the folders train and val of root; when rendering, the split files in source,
-    else val_fraction."""
-    val_fraction: Share = 0.1
-    """Fraction of the scans, at least one, for val if no split is given."""
+    else a tenth for val (thuman2: 0.19)."""
     pixel_centers: Literal["half", "integer", "auto"] = "half"
     """Pixel centres of the intrinsics in files. half: rendered by this package; integer: by the published
     scripts; auto: detected."""
@@ -193,7 +193,7 @@ class Scans(DataSet, _Renderable):
         return ScanSource(self.source_folder)
 
     def make(self) -> None:
-        """Render the scans of the split (up to ``limit``) that are missing in ``root``.
+        """Render the scans of the split that are missing in ``root``.
 
         Raises:
             InputError: ``source`` or ``root`` is null, a scan is invalid, or ``root`` contains other data.
@@ -201,7 +201,6 @@ class Scans(DataSet, _Renderable):
         source = self.scans()
         root = required_folder("data.root", "a folder", self.root)
         names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)
-        names = {phase: listed[: self.limit.of(phase)] for phase, listed in names.items()}
         render_people(root, names, source, self.rig.build(), self.render, _SEED, self.render_workers)
 
 

@@ -10,13 +10,13 @@ authors' release can be read without conversion."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Share, Size, Text
+from ghgs_lit.config.options import Size, Text
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
 from ghgs_lit.errors import InputError
@@ -138,12 +138,13 @@ def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
 class THuman2(Scans):
     """THuman2.0, raw and rendered."""
 
+    val_fraction: ClassVar[float] = 0.19
+
     name: Text = "thuman2"
     size: Size = 512
     render: RenderOptions = RenderOptions(
         size=1024, samples=2, views=(0, 1, 2, 3, 4), quality=95, lights="none"
     )
-    val_fraction: Share = 0.19
     pixel_centers: Literal["half", "integer", "auto"] = "auto"
     fits: options.PathText | None = None
     """Folder of <id>/smplx_param.pkl and mesh_smplx.obj; null: found by its usual names in or next to

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ghgs_lit.cli.runtime import announce, output_dir
-from ghgs_lit.config.nodes import Check
 from ghgs_lit.data.check import inspect
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
@@ -30,7 +29,7 @@ def run(verb: "Prepare") -> None:
         render(data)
         announce(root)
     else:
-        check(data, output_dir(), verb.check)
+        check(data, output_dir())
 
 
 def render(data: PhotographsDataModule) -> None:
@@ -47,18 +46,17 @@ def render(data: PhotographsDataModule) -> None:
         log.info("%s: %d subjects", phase, len(data.subjects(phase)) if data.dataset.has(phase) else 0)
 
 
-def check(data: PhotographsDataModule, folder: Path, expected: Check) -> None:
+def check(data: PhotographsDataModule, folder: Path) -> None:
     """Read all data once, print the findings, and write ``check.json``.
 
     Args:
         data: Data to check.
         folder: Folder for ``check.json``.
-        expected: Limits of good data.
 
     Raises:
         InputError: Something is missing or broken.
     """
-    report = inspect(data, expected.min_iou, expected.min_agreement)
+    report = inspect(data)
     report.show()
     folder.mkdir(parents=True, exist_ok=True)
     report.write(folder / "check.json")

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Measured, Training, Verb
-from ghgs_lit.config.nodes import Check, PerScene, Texts, Timing
+from ghgs_lit.config.nodes import PerScene, Texts, Timing
 from ghgs_lit.config.options import Count, PathText, Seed, Text, Workers, name_type
 
 
@@ -144,7 +144,6 @@ class Prepare(Verb):
 
     task: Literal["render", "check"] = "render"
     """render: render missing subjects. check: read every image and camera once."""
-    check: Check = Check()
     """Limits of good data for task=check."""
     seed: Seed = 0
     """Seed of the samples that task=check reads."""

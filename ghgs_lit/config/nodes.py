@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Text, name_type
+from ghgs_lit.config.options import Count, Index, Options, Positive, Text, name_type
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -72,16 +72,6 @@ class Timing(Options):
 
     repeats: int = Field(9, ge=1, le=1000)
     """Timed rounds; each runs all presets, and each starts with a different preset."""
-
-
-class Check(Options):
-    """Limits of good data for task=check."""
-
-    min_iou: Share = 0.5
-    """Minimum IoU of a body's silhouette and its mask; below it, the camera is considered wrong."""
-    min_agreement: Share = 0.9
-    """Without bodies: minimum share of a mask that is consistent with the subject's other masks and
-    cameras."""
 
 
 class EvaluationOptions(Options):

@@ -26,6 +26,10 @@ from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, Photo
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
 
+# Minimum IoU of a body's silhouette and a mask; clothed people reach 0.75 to 0.95, wrong cameras 0 to 0.4.
+_LEAST_IOU = 0.5
+# Without a body, minimum share of a mask that the subject's other masks allow; correct cameras reach 0.98.
+_LEAST_AGREEMENT = 0.9
 # A subject with all channels below this value, of 255, counts as black.
 _BLACK = 8
 # Height in metres above which another unit is likely.
@@ -101,8 +105,6 @@ class _Subjects(Dataset):
 
     reader: Reader
     listed: Sequence[tuple[str, Sequence[Photo]]]
-    min_iou: float
-    min_agreement: float
 
     def __len__(self) -> int:
         return len(self.listed)
@@ -136,8 +138,8 @@ class _Subjects(Dataset):
                 raise InputError(f"{place}: {problem}")
         else:
             report.iou.append(iou)
-            expected = f"the body in its mask (IoU of {self.min_iou:.2f} or more)"
-            if iou < self.min_iou:
+            expected = f"the body in its mask (IoU of {_LEAST_IOU:.2f} or more)"
+            if iou < _LEAST_IOU:
                 raise InputError(f"{place}: expected {expected}; found IoU {iou:.2f}")
         brightest = int(view.image[view.mask].max())
         if brightest < _BLACK:
@@ -150,24 +152,17 @@ class _Subjects(Dataset):
         report.tall = report.tall or measure_height(list(silhouettes.values()))
         report.agreement = SEARCH.shares(list(silhouettes.values()))
         least = min(report.agreement)
-        if least < self.min_agreement:
+        if least < _LEAST_AGREEMENT:
             worst = list(silhouettes)[report.agreement.index(least)]
             raise InputError(
                 f"{self.reader.place(report.name, *worst)}: expected a mask that the others of its subject "
-                f"allow ({self.min_agreement:.0%} of it or more); found {least:.0%} (wrong axes, units, "
+                f"allow ({_LEAST_AGREEMENT:.0%} of it or more); found {least:.0%} (wrong axes, units, "
                 "direction or size of a camera?)"
             )
 
 
-def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
-    """Read everything that training and evaluation would read, once, with the workers of ``data``.
-
-    Args:
-        min_iou: minimum IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75 to
-            0.95, wrong cameras 0 to 0.4.
-        min_agreement: without a body, the minimum share of a mask that the subject's other masks allow,
-            in [0, 1]; correct cameras reach 0.98 to 1.
-    """
+def inspect(data: PhotographsDataModule) -> Report:
+    """Read everything that training and evaluation would read, once, with the workers of ``data``."""
     report = Report()
     dataset = data.dataset
     # Static cameras allow only one protocol.
@@ -192,7 +187,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
             listed.append((name, photos))
         reports[phase] = []
         if listed:
-            items = _Subjects(reader, listed, min_iou, min_agreement)
+            items = _Subjects(reader, listed)
             loader = make_loader(items, min(data.workers(len(items)), len(items)))
             console = Console(stderr=True)
             reports[phase] += track(loader, f"checking {phase}", total=len(items), console=console)

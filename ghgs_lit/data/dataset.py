@@ -33,19 +33,6 @@ def required_folder(key: str, expected: str, value: str | None) -> Path:
     return Path(value).expanduser()
 
 
-class Limit(Options):
-    """Limits on the numbers of subjects."""
-
-    train: Count | None = None
-    """Use only this number of training subjects, the first ones; null: all."""
-    val: Count | None = None
-    """Use only this number of validation subjects, the first ones; null: all."""
-
-    def of(self, phase: str) -> int | None:
-        """Maximum number of subjects of a phase; None: all."""
-        return getattr(self, phase, None)
-
-
 class DataOptions(Options):
     """Base class for options of data sets, which builds the data module.
 
@@ -155,5 +142,3 @@ class DataSet(DataOptions):
 
     root: PathText | None = None
     """Folder of the data."""
-    limit: Limit = Limit()
-    """Maximum number of subjects of each phase."""

@@ -133,7 +133,6 @@ class FrameReader(Reader):
                 self.frames |= {check_name(f"{name}_{frame.number:06d}"): frame for frame in found}
                 if len(found) < len(wanted):
                     log.info("%s: %d of %d frames are there", folder / name, len(found), len(wanted))
-        self.frames = dict(list(self.frames.items())[: data.limit.of(phase)])
         self.subjects = {name: frame.positions for name, frame in self.frames.items()}
 
     @abstractmethod

@@ -5,7 +5,6 @@
 
     kinect_color/kinect_<k>/<frame>.png   images, 1920 x 1080
     kinect_mask/kinect_<k>/<frame>.png    masks from matting: all values except 0 are the performer
-    kinect_mask_manual/                   likewise, for the test sequences only
     smpl_params/<frame>.npz               parameters of the SMPL body
     cameras.json                          for each ``kinect_color_<k>`` K (3, 3), R (3, 3) and T (3) as in
                                           OpenCV, world to camera, metres, without lens distortion
@@ -14,7 +13,7 @@
 import logging
 import re
 from pathlib import Path, PurePosixPath
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -96,7 +95,7 @@ class HuMManReader(FrameReader):
         return self._file(frame, _COLOR, position)
 
     def masks(self, frame: Frame, position: int) -> list[Path]:
-        return [self._file(frame, self.data.masks, position)]
+        return [self._file(frame, "kinect_mask", position)]
 
     def _file(self, frame: Frame, kind: str, position: int) -> Path:
         path = frame.folder / kind / frame.photographs[position]
@@ -137,8 +136,6 @@ class HuMMan(DataSet):
     """Sequences of each phase."""
     frames: tuple[Index, Index, Count] = (0, 97, 6)
     """[start, stop, step] of frame numbers; frames that a sequence lacks are skipped."""
-    masks: Literal["kinect_mask", "kinect_mask_manual"] = "kinect_mask"
-    """Folder of masks; kinect_mask_manual exists for the test sequences only."""
     smpl_model: options.PathText | None = None
     """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl, whose vertices are the
     bodies; requires the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""

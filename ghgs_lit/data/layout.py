@@ -91,8 +91,7 @@ _BODY_MODELS = ("smpl", "smplx")
 
 
 class Rendered(DataOptions):
-    """Base options for data in the rendered layout; subclasses define ``root``, ``limit`` and
-    ``pixel_centers``."""
+    """Base options for data in the rendered layout; subclasses define ``root`` and ``pixel_centers``."""
 
     @property
     def facts(self) -> dict[str, str]:
@@ -110,8 +109,7 @@ class Rendered(DataOptions):
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
         names = self.subject_names(phase)
-        limit = self.limit.of(phase)
-        return Layout(self.folder, phase, names, limit, self.pixel_centers, strict)
+        return Layout(self.folder, phase, names, self.pixel_centers, strict)
 
 
 class Layout(Reader):
@@ -121,7 +119,6 @@ class Layout(Reader):
         phase: ``train`` or ``val``.
         names: subjects to read; those that are not in the phase's folder are read from the other one, as
             the split may have changed; None: all.
-        limit: maximum number of subjects, the first ones; None: all.
         pixel_centers: the renderer's convention: ``half`` (+0.5, as in this package), ``integer`` (as in
             the published scripts) or ``auto`` (integer unless this package rendered the data).
         strict: whether to raise the first problem or to collect all.
@@ -136,7 +133,6 @@ class Layout(Reader):
         root: str | Path,
         phase: str,
         names: Sequence[str] | None = None,
-        limit: int | None = None,
         pixel_centers: str = "half",
         strict: bool = True,
     ) -> None:
@@ -160,7 +156,7 @@ class Layout(Reader):
                 )
         planned = self._complete.plan.get(phase, [])
         listed = {*stored[phase], *planned}
-        wanted = (sorted(listed) if names is None else list(map(normalize_name, names)))[:limit]
+        wanted = sorted(listed) if names is None else list(map(normalize_name, names))
         homes = {}
         for name in wanted:
             homes[name] = next((p for p in phases if name in stored[p]), phase)

@@ -55,7 +55,7 @@ def make(
     for index, name in enumerate([*training, *test[: people_of["val"]]]):
         folder = root / name
         folder.mkdir(parents=True, exist_ok=True)
-        _write_sequence(folder, size / _WIDTH, frames, (seed, index), manual=index >= len(training))
+        _write_sequence(folder, size / _WIDTH, frames, (seed, index))
         folders.append(folder)
     return [*folders, write_stand_in(body_models(root))]
 
@@ -65,9 +65,7 @@ def body_models(root: Path) -> Path:
     return root.with_name(f"{root.name}_body_models")
 
 
-def _write_sequence(
-    folder: Path, scale: float, frames: Sequence[int], identity: tuple[int, int], manual: bool
-) -> None:
+def _write_sequence(folder: Path, scale: float, frames: Sequence[int], identity: tuple[int, int]) -> None:
     rng = np.random.default_rng(identity)
     person, lights = figures.generate(*identity), Lights().draw(rng)
     cameras = _rig(scale, rng)
@@ -82,7 +80,7 @@ def _write_sequence(
         fit = parameters(*identity, person, to_world @ pose)
         (folder / "smpl_params").mkdir(exist_ok=True)
         np.savez(folder / "smpl_params" / f"{number:06d}.npz", **fit)
-        _write_frame(folder, number, capture.move_person(person, pose), lights, cameras, manual)
+        _write_frame(folder, number, capture.move_person(person, pose), lights, cameras)
 
 
 def _rig(scale: float, rng: np.random.Generator) -> Cameras:
@@ -111,9 +109,7 @@ def _write_cameras(folder: Path, cameras: Cameras, from_world: torch.Tensor) -> 
     (folder / "cameras.json").write_text(json.dumps(content))
 
 
-def _write_frame(
-    folder: Path, number: int, person: Person, lights: LightRig, cameras: Cameras, manual: bool
-) -> None:
+def _write_frame(folder: Path, number: int, person: Person, lights: LightRig, cameras: Cameras) -> None:
     shots = Studio(person, lights, samples=1).shoot(cameras)
     for k in range(KINECTS):
         image = capture.add_background(shots.images[k], shots.masks[k], 0.9 + 0.02 * k)
@@ -122,7 +118,5 @@ def _write_frame(
             "kinect_color": image.astype(np.uint8),
             "kinect_mask": hard.filter(ImageFilter.GaussianBlur(0.5)),
         }
-        if manual:
-            written["kinect_mask_manual"] = hard
         for kind, picture in written.items():
             capture.save_image(folder / kind / f"kinect_{k:03d}" / f"{number:06d}.png", picture)

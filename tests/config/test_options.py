@@ -91,7 +91,7 @@ def test_yaml_and_options_of_a_verb_agree(verb):
 #: Integers that need no limit, by reason: no value hangs or exhausts memory.
 UNLIMITED = {
     "there are no more": """
-        subjects subject limit.train limit.val pictures k tolerance chamfer_points limit_val_batches
+        subjects subject pictures k tolerance chamfer_points limit_val_batches
         start stop step split frames cameras""",
     "refused where there are fewer": """
         evaluation_positions positions views evaluation_count training_counts per_subject per_step layers

@@ -25,9 +25,8 @@ from tests.helpers.people import TINY, equal, rendered
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
     """data.root and data.batch_size are keys of one node, and paths may be ``pathlib`` objects."""
-    data = rendered(Path("x"), batch_size=3, limit={"val": 2}, workers=1).dataset
-    assert data == Scans(root="x", size=[28, 28], batch_size=3, limit={"val": 2}, workers=1, render=TINY)
-    assert [data.limit.of(phase) for phase in ("train", "val", "bench")] == [None, 2, None]
+    data = rendered(Path("x"), batch_size=3, workers=1).dataset
+    assert data == Scans(root="x", size=[28, 28], batch_size=3, workers=1, render=TINY)
     assert (data.size, data.target_size) == ((28, 28), None)
     assert (data.batch_size, data.workers) == (3, 1)
 

@@ -387,7 +387,6 @@ HUMMAN_SETTINGS = [
         "data.smpl_model=/nowhere",
         "/nowhere: expected SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl",
     ),
-    ("data.masks=mask", "data.masks: expected one of kinect_mask, kinect_mask_manual; found 'mask'"),
     ("data.frames=[0,0,6]", r"data.frames: expected \[start, stop, step\] with start < stop; found"),
     ("data.split.val=[]", r"data.split.val: expected a list \(each a text\); found \[\]"),
     ("data.split.val=null", r"data.split.val: expected a list \(each a text\); found None"),

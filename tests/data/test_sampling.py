@@ -202,13 +202,12 @@ def test_training_resumes_with_the_very_next_draw(boxes, tmp_path):
 
 
 def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
-    """Lengths depend on subjects, batch size, steps_per_epoch and limit; evaluation repeats exactly."""
+    """Lengths depend on subjects, batch size and steps_per_epoch; evaluation repeats exactly."""
     data = module(boxes)
     assert len(data.train_dataloader()) == 100  # 50 passes over 3 subjects, 2 at a time
     assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]
     assert [len(b.subjects) for b in data.evaluation_loader(split="train", batch_size=2)] == [2, 1]
     assert len(module(boxes, steps_per_epoch=7).train_dataloader()) == 7
-    assert list(module(boxes, limit={"train": 2}).subjects("train")) == ["s0", "s1"]
     again = [b for _ in range(2) for b in module(boxes).val_dataloader()]
     assert equal(*again)
 
@@ -237,8 +236,6 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
         ),
         ({"size": [3, 4, 5]}, "data.size: expected an integer >= 1 and <= 8192 or a list of 2 values"),
         ({"pixel_centers": "corner"}, "data.pixel_centers: expected one of half, integer"),
-        ({"limit": {"test": 3}}, "data.limit.test: expected one of train, val"),
-        ({"limit": {"train": 0}}, "data.limit.train: expected an integer >= 1 or null"),
         ({"workers": -1}, "data.workers: expected an integer >= 0"),
     ],
 )

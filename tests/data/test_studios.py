@@ -272,13 +272,6 @@ def test_any_value_of_the_matting_is_the_performer(humman_root):
     np.testing.assert_array_equal(of_humman(humman_root).view(f"{HUMMAN}_000006", 2).mask, matting > 0)
 
 
-def test_drawn_masks_are_read_where_there_are_any(humman_root):
-    """data.masks selects the folder of manual masks, which only test sequences have."""
-    view = of_humman(humman_root, masks="kinect_mask_manual").view(f"{HUMMAN}_000006", 2)
-    assert view.mask.sum() < of_humman(humman_root).view(f"{HUMMAN}_000006", 2).mask.sum()
-    assert not (humman_root / "p100001_a000048" / "kinect_mask_manual").exists()
-
-
 def test_no_body_is_a_choice(humman_root):
     """Without a body model, ``body_vertices`` of batches is None, for training without the Chamfer loss."""
     assert of_humman(humman_root).reader.read_checked_body(f"{HUMMAN}_000000") is None

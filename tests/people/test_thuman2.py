@@ -58,8 +58,7 @@ def test_published_renders_have_integer_pixel_centres(rendered):
 def test_own_renders_have_half_pixel_centres(raw, tmp_path):
     """pixel_centers=auto does not change the centres of our own renderings."""
     render = {"size": 48, "samples": 1, "views": (0, 3), "positions": (0, 1, 2, 3)}
-    limit = {"val": 1, "train": 1}
-    data = module(str(tmp_path), source=str(raw), limit=limit, render=render, render_workers=0)
+    data = module(str(tmp_path), source=str(raw), render=render, render_workers=0)
     data.dataset.make()
     K = stored(data, "train").view("0000", 0, 0).intrinsics
     np.testing.assert_allclose(K[:2, 2], [24, 24 + 48 * 25 / 1024], atol=1e-5)
