@@ -99,7 +99,7 @@ class LightRig:
     brightness: float
     exposure: float | None = None
 
-    def exposed(self, brightness: float) -> "LightRig":
+    def expose(self, brightness: float) -> "LightRig":
         """Set the exposure if it is not set.
 
         It compensates half (in logarithms) of a subject's deviation from a typical brightness, such as

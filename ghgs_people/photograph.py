@@ -122,7 +122,7 @@ class Studio:
         cameras = around.cameras(np.arange(8) * 45.0, _TRIAL, _TRIAL)
         corners[..., 2:] = (_DIM * light - 1)[self._faces]  # dimmed so that no highlight is compressed
         trial = self.shoot(cameras)
-        self.lights = self.lights.exposed(float(trial.images.mean() / trial.alphas.mean()) / _DIM)
+        self.lights = self.lights.expose(float(trial.images.mean() / trial.alphas.mean()) / _DIM)
         corners[..., 2:] = (self.lights.exposure * light - 1)[self._faces]
 
     def _is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -218,12 +218,8 @@ def perturb_cameras(
 def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
     """Corners of the boxes around masks in pixels; those of the image for an empty mask."""
     masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
-    corners = []
-    for mask in masks:
-        columns = mask.any(0).nonzero()[[0, -1], 0] + torch.tensor([0, 1])
-        rows = mask.any(1).nonzero()[[0, -1], 0] + torch.tensor([0, 1])
-        corners.append(torch.cartesian_prod(columns, rows))
-    return torch.stack(corners).double()
+    boxes = [([one.left, one.right], [one.top, one.bottom]) for one in extents(masks)]
+    return torch.stack([torch.cartesian_prod(*map(torch.tensor, box)) for box in boxes]).double()
 
 
 def _repeat_for_corners(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
@@ -264,10 +260,8 @@ def cut_subjects(batch: Batch, chance: float, rngs: list[np.random.Generator]) -
     shares = np.ones(batch.masks.shape[:2])
     ends = np.ones(len(rngs))
     for b, rng in enumerate(rngs):
-        is_cut, everywhere, *drawn = rng.uniform(size=3 + 2 * views)
-        height = drawn[0]
-        chosen = np.array(drawn[1 : 1 + views])
-        heights = np.array(drawn[1 + views :])
+        is_cut, everywhere, height, *others = rng.uniform(size=3 + 2 * views)
+        chosen, heights = np.reshape(others, (2, views))
         low, high = _SHOWN
         if is_cut >= chance:
             continue

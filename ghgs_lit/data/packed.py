@@ -85,13 +85,14 @@ class Packs:
         path = self.paths[name]
         if path is None:
             return None
-        pack = _try_open(path)
-        if pack is None and self.writes:
+        file = _try_open(path)
+        if file is None and self.writes:
             self._write(name, path)
-            pack = _try_open(path)
-        if pack is None:  # do not try again
-            self.paths[name] = None
-        return None if pack is None or depth > self.depths else pack.view(position, view, depth)
+            file = _try_open(path)
+        if file is None:
+            self.paths[name] = None  # do not try again
+            return None
+        return None if depth > self.depths else _read_view(file, position, view, depth)
 
     def _path(self, name: str) -> Path | None:
         """Path of a subject's file, named after the names, sizes and times of its sources; None: unknown
@@ -127,27 +128,21 @@ class Packs:
             log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
 
 
-class Pack:
-    """Reader of the packed images of one subject, in the file ``path``."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = safe_open(path, "np")
-        self._names = frozenset(self._file.keys())
-
-    def view(self, position: int, view: int, depth: bool) -> View | None:
-        """Read one view, see :meth:`Packs.view`; None: it is not in the file."""
-        place = f"{position}/{view}/"
-        if place + "box" not in self._names:
-            return None
-        height, width, top, bottom, left, right = self._file.get_tensor(place + "box").tolist()
-        arrays = {name: self._file.get_tensor(place + name) for name in _CAMERA}
-        for name in _MAPS:
-            arrays[name] = None
-            if place + name in self._names and (depth or name != "inverse_depth"):
-                part = self._file.get_tensor(place + name)
-                arrays[name] = np.zeros((height, width, *part.shape[2:]), part.dtype)
-                arrays[name][top:bottom, left:right] = part
-        return View(**arrays)
+def _read_view(file: safe_open, position: int, view: int, depth: bool) -> View | None:
+    """Read one view of a packed file, see :meth:`Packs.view`; None: it is not in the file."""
+    names = set(file.keys())
+    place = f"{position}/{view}/"
+    if place + "box" not in names:
+        return None
+    height, width, top, bottom, left, right = file.get_tensor(place + "box").tolist()
+    arrays = {name: file.get_tensor(place + name) for name in _CAMERA}
+    for name in _MAPS:
+        arrays[name] = None
+        if place + name in names and (depth or name != "inverse_depth"):
+            part = file.get_tensor(place + name)
+            arrays[name] = np.zeros((height, width, *part.shape[2:]), part.dtype)
+            arrays[name][top:bottom, left:right] = part
+    return View(**arrays)
 
 
 def _pack_view(position: int, number: int, view: View) -> dict[str, np.ndarray]:
@@ -166,15 +161,15 @@ def _pack_view(position: int, number: int, view: View) -> dict[str, np.ndarray]:
     return {f"{position}/{number}/{name}": array for name, array in arrays.items()}
 
 
-def _try_open(path: Path) -> Pack | None:
+_open = functools.lru_cache(maxsize=_OPEN_FILES)(functools.partial(safe_open, framework="np"))
+
+
+def _try_open(path: Path) -> safe_open | None:
     """Open the file at ``path``; None if it is missing or incomplete."""
     try:
         return _open(path)
     except (OSError, SafetensorError):
         return None
-
-
-_open = functools.lru_cache(maxsize=_OPEN_FILES)(Pack)
 
 
 def _digest(facts: list) -> str:

@@ -92,13 +92,13 @@ def aim(pixels, width, samples, matrix, pose, rays):
 
 
 @helper
-def _between(a, b, c, d, shares):
+def _blend(a, b, c, d, shares):
     """Mean of four texels, 0 to 255, weighted by ``shares``."""
     return shares[0] * LEVELS[a] + shares[1] * LEVELS[b] + shares[2] * LEVELS[c] + shares[3] * LEVELS[d]
 
 
 @helper
-def _mixed(corners, face, weights, k):
+def _interpolate(corners, face, weights, k):
     """Interpolate attribute ``k`` (0 to 3) at a hit with barycentric ``weights``.
 
     ``corners`` [m, 3, 4] has u and v of the texture, and light minus 1 in front and behind each corner."""
@@ -109,14 +109,14 @@ def _mixed(corners, face, weights, k):
 @helper
 def _light(surface, face, weights, rays, n):
     """Factor on the texture at a hit, on the side that ray ``n`` comes from; ``surface`` has corners as in
-    :func:`_mixed` and unit normals [m, 3] of the faces."""
+    :func:`_interpolate` and unit normals [m, 3] of the faces."""
     corners, flat, _ = surface
     along = flat[face, 0] * rays[n, 0] + flat[face, 1] * rays[n, 1] + flat[face, 2] * rays[n, 2]
-    return ONE + _mixed(corners, face, weights, 3 if along > ZERO else 2)
+    return ONE + _interpolate(corners, face, weights, 3 if along > ZERO else 2)
 
 
 @helper
-def _compressed(value, knee):
+def _compress(value, knee):
     """Compress a brightness to below 1, with a decreasing slope above the knee."""
     return value if value <= knee else ONE - (ONE - knee) * (ONE - knee) / (value - (knee + knee - ONE))
 
@@ -126,7 +126,7 @@ def _color(surface, textures, face, weights):
     """Bilinear sample of a repeating texture at a hit, 0 to 1.
 
     Args:
-        surface: corners as in :func:`_mixed`, normals, and the part [m] of each face.
+        surface: corners as in :func:`_interpolate`, normals, and the part [m] of each face.
         textures: texels [t, 3] of all parts; first texel, height and width [k, 3] of each part.
         face: index of the face.
         weights: barycentric coordinates of the hit.
@@ -134,8 +134,8 @@ def _color(surface, textures, face, weights):
     corners, _, parts = surface
     texels, shapes = textures
     first, height, width = shapes[parts[face], 0], shapes[parts[face], 1], shapes[parts[face], 2]
-    x = _mixed(corners, face, weights, 0) * np.float32(width) - HALF
-    y = (ONE - _mixed(corners, face, weights, 1)) * np.float32(height) - HALF
+    x = _interpolate(corners, face, weights, 0) * np.float32(width) - HALF
+    y = (ONE - _interpolate(corners, face, weights, 1)) * np.float32(height) - HALF
     left = math.floor(x)
     top = math.floor(y)
     fx = x - np.float32(left)
@@ -150,9 +150,9 @@ def _color(surface, textures, face, weights):
     d = texels[first + bottom * width + right]
     shares = ((ONE - fx) * (ONE - fy), fx * (ONE - fy), (ONE - fx) * fy, fx * fy)
     return (
-        _between(a[0], b[0], c[0], d[0], shares),
-        _between(a[1], b[1], c[1], d[1], shares),
-        _between(a[2], b[2], c[2], d[2], shares),
+        _blend(a[0], b[0], c[0], d[0], shares),
+        _blend(a[1], b[1], c[1], d[1], shares),
+        _blend(a[2], b[2], c[2], d[2], shares),
     )
 
 
@@ -187,9 +187,9 @@ def expose(pixels, order, rays, hits, surface, textures, knee, image, matte, dep
             weights = (ONE - us[n] - vs[n], us[n], vs[n])
             light = _light(surface, face, weights, rays, n)
             color = _color(surface, textures, face, weights)
-            red += _compressed(color[0] * light, knee)
-            green += _compressed(color[1] * light, knee)
-            blue += _compressed(color[2] * light, knee)
+            red += _compress(color[0] * light, knee)
+            green += _compress(color[1] * light, knee)
+            blue += _compress(color[2] * light, knee)
         if hit == ZERO:
             continue
         place = pixels[p]

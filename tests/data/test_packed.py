@@ -196,7 +196,7 @@ def test_short_trainings_write_nothing(root):
     def steps(count):
         data = rendered(root, steps_per_epoch=4, workers=0)
         data.trainer = Trainer(max_steps=count, accelerator="cpu", logger=False, enable_checkpointing=False)
-        return data.train_dataloader()
+        next(iter(data.train_dataloader()))
 
     steps(20)  # of 5 images each; the data has 2 x 16 x 4
     assert not files(root)
