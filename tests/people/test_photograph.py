@@ -56,53 +56,6 @@ def shoot(parts, cameras, samples=3, lights=None):
     return photographs.images[0], photographs.masks[0], photographs.depths[0]
 
 
-def test_sphere_depth_and_coverage_are_analytic():
-    """Depth and coverage agree with ray-sphere intersection in float64 and dense sampling."""
-    radius, size, distance = 0.6, 56, 2.0
-    sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
-    camera = front_camera(size, distance, shift=3.3)
-    image, mask, depth = shoot([mesh_part(sphere)], camera, samples=5)
-
-    def discriminant(offsets):
-        rays_x = (offsets[None, :] - size / 2 - 3.3) / size
-        rays_y = (offsets[:, None] - size / 2) / size
-        squared = rays_x**2 + rays_y**2 + 1
-        return distance**2 - squared * (distance**2 - radius**2), squared
-
-    inside, squared = discriminant(np.arange(size) + 0.5)
-    expected = (distance - np.sqrt(np.maximum(inside, 0))) / squared
-    clear = mask & (inside > 0.05)  # off the rim, where a facetted sphere departs from a round one
-    assert clear.sum() > 300
-    np.testing.assert_allclose(depth[clear], expected[clear], atol=1e-3)
-    fine, _ = discriminant((np.arange(size * 20) + 0.5) / 20)
-    coverage = (fine > 0).reshape(size, 20, size, 20).mean((1, 3))
-    assert np.abs(image[..., 0] - coverage).max() < 0.16  # 5 x 5 samples of a pixel
-    assert abs(image[..., 0].sum() - coverage.sum()) < 2e-3 * coverage.sum()
-    sure = np.abs(coverage - 0.5) > 0.1
-    assert (mask == (coverage >= 0.5))[sure].all()
-
-
-def test_square_covers_exactly_the_pixels_it_should():
-    """No shift by half a pixel: edges at pixel boundaries are sharp, others have their exact coverage."""
-    size = 32
-    image, mask, depth = shoot([quad(half=0.5)], front_camera(size))  # ± 0.5 * 32 / 2 = ± 8 pixels
-    expected = np.zeros((size, size))
-    expected[8:24, 8:24] = 1
-    np.testing.assert_allclose(image[..., 0], expected, atol=1e-6)
-    assert (mask == expected.astype(bool)).all()
-    np.testing.assert_allclose(depth, 2.0 * expected, atol=1e-6)
-    third = 0.5 * 17 / 16 - 0.5 / 48  # edge at 8.333 pixels from the centre
-    image, mask, depth = shoot([quad(half=third)], front_camera(size))
-    np.testing.assert_allclose(image[16, 7, 0], 1 / 3, atol=1e-6)
-    assert mask.sum() == 16 * 16
-    taken = Studio(Person("p", (quad(half=third),), None), None).shoot(front_camera(size))
-    np.testing.assert_allclose(taken.alphas[0, 16, 6:9], [0, 1 / 3, 1], atol=1e-6)
-    np.testing.assert_allclose(taken.alphas[0, 7, 7], 1 / 9, atol=1e-6)
-    # The surface is white: a photograph on black is its matte. What shows at all has a depth.
-    np.testing.assert_allclose(taken.images[0, ..., 0], taken.alphas[0], atol=1e-6)
-    np.testing.assert_allclose(depth, 2.0 * (taken.alphas[0] > 0), atol=1e-6)
-
-
 def test_depth_never_mixes_two_surfaces():
     """At edges, depth is that of one surface, never a mean between two."""
     near = quad(z=0.5, half=0.2, x=0.05)
@@ -112,22 +65,6 @@ def test_depth_never_mixes_two_surfaces():
         values = depth[mask]
         assert ((np.abs(values - 1.5) < 1e-5) | (np.abs(values - 2.5) < 1e-5)).all()
         assert (np.abs(values - 1.5) < 1e-5).sum() > 50
-
-
-def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
-    """With an odd number of samples depth is exact at pixel centres:
-    unprojected points lie on the plane."""
-    part = quad(half=0.6)
-    turned = trimesh.transformations.rotation_matrix(0.7, [0.3, 1, 0.1])[:3, :3].astype(np.float32)
-    part = TexturedMesh(part.vertices @ turned.T, part.faces, part.uv, part.texture)
-    camera = front_camera(48)
-    _, mask, depth = shoot([part], camera)
-    points = unproject_maps(torch.from_numpy(depth), camera[0]).numpy()[mask]
-    assert len(points) > 200
-    # At the rim a pixel whose centre misses takes the nearest hit, at most half a pixel away.
-    distance = np.abs(points @ turned[:, 2])
-    assert np.quantile(distance, 0.9) < 1e-6
-    assert distance.max() < 0.03
 
 
 def test_vertices_project_into_the_mask_from_every_side():
@@ -329,15 +266,6 @@ def test_camera_beside_and_inside_the_subject():
     _, mask, depth = shoot([quad(z=0.0, half=5), quad(z=3.0, half=5)], front_camera(16))
     assert mask.all()
     np.testing.assert_allclose(depth, 2.0, atol=1e-5)
-
-
-@pytest.mark.parametrize("value", [0.0, -5.0, float("nan")])
-def test_bad_focal_length_is_refused(value):
-    """An error with the camera's number instead of an empty photograph."""
-    camera = front_camera(16)
-    camera.intrinsics[:, 0, 0] = value
-    with pytest.raises(InputError, match="camera 0: expected finite values and focal lengths above 0"):
-        shoot([quad()], camera)
 
 
 def test_ring_has_the_angles_of_the_layout():
