@@ -7,11 +7,11 @@ from hydra._internal.core_plugins import basic_sweeper
 from hydra.core.config_store import ConfigStore
 
 
-def rehearse(configs: list[Any]) -> Any:
+def rehearse(planned: list[Any]) -> Any:
     """What a dry run tries, of a room above that of sweeps."""
     from ghgs_lit.cli import rehearsal  # here: other commands need no PyTorch yet
 
-    return rehearsal.rehearse(configs)
+    return rehearsal.rehearse(planned)
 
 
 class GridSweeper(basic_sweeper.BasicSweeper):

@@ -130,17 +130,11 @@ def steps_of_csv(run: Path, name: str) -> list[tuple[int, float]]:
 
 def steps_of_tensorboard(folder: Path, name: str) -> list[int]:
     """Steps of a tag in all event files, including events that TensorBoard would discard."""
-    events = [e for path in folder.glob("events.*") for e in EventFileLoader(str(path)).Load()]
+    events = [e for path in folder.rglob("events.*") for e in EventFileLoader(str(path)).Load()]
     return sorted(e.step for e in events for value in e.summary.value if value.tag == name)
 
 
-def curves_of(sweep: Path, run: Path) -> Path:
-    identity = json.loads((run / "run.json").read_text())["id"]
-    owners = [path.parent for path in sweep.glob("tb/*/.run") if path.read_text() == identity]
-    return owners[0] if owners else run / "tensorboard"
-
-
-def faults_of(sweep: Path, run: Path, steps: int) -> list[str]:
+def faults_of(run: Path, steps: int) -> list[str]:
     """Faults of a completed run."""
     every, validations = list(range(1, steps + 1)), list(range(VALIDATION, steps + 1, VALIDATION))
     results = json.loads((run / "metrics.json").read_text())
@@ -151,7 +145,7 @@ def faults_of(sweep: Path, run: Path, steps: int) -> list[str]:
     scores = steps_of_csv(run, "val/psnr")
     top = max(score for _, score in scores)
     state = next(value for key, value in last["callbacks"].items() if "val/psnr" in key)
-    curves = curves_of(sweep, run)
+    curves = run / "tensorboard"
     found = {
         "hash of the configuration": (results["provenance"]["config_hash"], run.name),
         "sessions that ended well": ([s["outcome"] for s in sessions if "outcome" in s].count("done"), 1),
@@ -194,7 +188,7 @@ def main() -> int:
     runs = sorted(path.parent for path in drill.sweep.glob("*/metrics.json"))
     count = len(SEEDS) * len(ABLATIONS)
     faults += [f"{len(runs)} runs have results, expected {count}"] * (len(runs) != count)
-    faults += [fault for run in runs for fault in faults_of(drill.sweep, run, arguments.steps)]
+    faults += [fault for run in runs for fault in faults_of(run, arguments.steps)]
     (undisturbed,) = (path.parent for path in whole.glob("*/metrics.json"))
     tensors = find_differences(undisturbed, drill.sweep / undisturbed.name)
     faults += [f"{len(tensors)} tensors differ from those of an undisturbed run"] * bool(tensors)

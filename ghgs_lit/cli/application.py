@@ -1,5 +1,6 @@
 """Run a verb as a Hydra application of ``conf/<verb>.yaml``."""
 
+import contextlib
 import os
 import re
 import signal
@@ -33,6 +34,23 @@ from ghgs_lit.runtime.cores import let_children_sleep
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
 read_as_ghgs()
+
+
+def remove_unused(directory: Path, since: float) -> None:
+    """Remove the directory that Hydra created for a command if it has no file but the configuration of
+    this command.
+
+    Args:
+        directory: Directory of the run.
+        since: Time of startup in seconds since the epoch; older files and directories are kept.
+    """
+    if not directory.is_dir() or directory.samefile(".") or directory.stat().st_mtime < since:
+        return
+    written = directory / "config.yaml"
+    if all(path == written and path.lstat().st_mtime >= since for path in directory.iterdir()):
+        written.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # another process has begun a run in it
+            directory.rmdir()
 
 
 #: Names that a run appends to or that libraries write in place, in addition to the log.
@@ -69,26 +87,24 @@ def work(cfg: DictConfig, name: str, argv: Sequence[str], started: float) -> obj
         fits = is_given or not cfg.get("overwrite")
         require(fits, "overwrite", "a value on the command line alone", "true in a file")
         verb = verb_class(name).begin(to_plain(cfg))
+        verb.require_files()
+        verb.complete(to_plain(fill(cfg)))  # before slow imports of the verb
         is_dry = getattr(verb, "dry_run", False)
         if verb.begins_run and not is_dry:
-            if directory.marker is not None:  # start() compares whole configurations
-                verb.complete(to_plain(fill(cfg)))
             directory.start(verb)
         if not is_dry:
             require_no_links(directory.path, (*_WRITTEN_IN_PLACE, f"{hydra_node.job.name}.log"))
-        verb.require_files()
-        verb.complete(to_plain(fill(cfg)))  # before slow imports of the verb
         collect_garbage_again()
         let_children_sleep()
         result = verb.run()
         if is_dry:
-            directory.discard({f"{name}.log"}, started)
+            remove_unused(directory.path, started)
         return result
     except messages.BAD_INPUT as error:
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:
             error.filename = str(directory.path)  # of a full disk, for example
         if is_single:
-            directory.discard({f"{name}.log"}, started)
+            remove_unused(directory.path, started)
             # Hydra would print a line about errors that leave its job.
             print(f"ghgs {name}: {messages.format_error(error, name)}", file=sys.stderr)
             raise SystemExit(1) from error

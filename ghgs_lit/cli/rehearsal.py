@@ -15,9 +15,9 @@ from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.plan import PlannedRun, Rehearsal, print_plan
 from ghgs_lit.runs.results import config_hash
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.sweep import PlannedRun, print_plan
 from ghgs_lit.training import start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -27,27 +27,36 @@ if TYPE_CHECKING:
     from ghgs_lit.data.dataset import DataSet
 
 
-def rehearse(runs: Sequence["Train"]) -> Rehearsal:
+def rehearse(planned: Sequence[PlannedRun]) -> list[str]:
     """Check the prerequisites of runs, each configuration once; renders and writes nothing and takes no
-    step."""
+    step.
+
+    Returns:
+        One line for everything that is missing.
+    """
     findings = _Findings()
-    distinct = {config_hash({**run.plain, "seed": 0}): run for run in runs}
+    runs = {config_hash({**item.run.plain, "seed": 0}): item.run for item in planned}
+    # Configurations of a sweep often have the same data.
+    of_data = ("data", "augmentation", "views", "targets", "loss", "evaluation")
+    data = {config_hash({key: run.plain[key] for key in of_data}): run for run in runs.values()}
     silence_lightning()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for run in distinct.values():
-            findings.check(run.with_changes(data={"workers": 0}), Path(folder))
-    return Rehearsal(_summarize(findings.reasons), list(findings.notes))
+        for item in planned:
+            if item.directory.checkpoint is not None:
+                findings.attempt(read_checkpoint, item.directory.checkpoint)
+        for run in runs.values():
+            findings.check(run, Path(folder))
+        for run in data.values():
+            findings.check_data(run.with_changes(data={"workers": 0}))
+    return _summarize(findings.reasons)
 
 
 class _Findings:
-    """Reasons and notes, stored as keys in order of appearance."""
+    """Reasons, stored as keys in order of appearance."""
 
     def __init__(self) -> None:
         self.reasons: dict[str, None] = {}
-        self.notes: dict[str, None] = {}
-        #: Whether all files exist, by (hash of data, phase); configurations may share data.
-        self.complete: dict[tuple[str, str], bool] = {}
 
     def attempt(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         """Result of a call; None if it raises an input error, which becomes a reason."""
@@ -68,46 +77,41 @@ class _Findings:
         for options in (run.loss, run.optimizer, run.metrics):
             self.attempt(options.build)
         model = self.attempt(GHGS.from_config, run.plain, empty=True)
-        data = self.attempt(build_data, run)
-        if model is not None and run.init_from is not None:
-            options = run.init_strict, run.allow_random_encoder
-            lines = self.attempt(start.initialize, model, run.init_from, *options) or ()
-            if unfit := sum(line.startswith("wrong shape") for line in lines):
-                left = f"{unfit} of {len(lines)} tensors have another shape in {run.init_from}"
-                self.notes[f"init_from: {left}, and stay as initialised"] = None
-        if model is not None and data is not None:
-            self.attempt(check_size, data, Predictor(model))
-        if data is None or not self.check_data(run, data):
+        if model is None:
             return
-        if model is not None and run.feature_cache is not None:
-            needed = self.attempt(run.feature_cache.needs, model, data)
-            self.notes |= {} if needed is None else {needed: None}
+        if run.init_from is not None:
+            options = run.init_strict, run.allow_random_encoder
+            self.attempt(start.initialize, model, run.init_from, *options)
+        data = self.attempt(build_data, run)
+        if data is not None:
+            self.attempt(check_size, data, Predictor(model))
+            if run.feature_cache is not None and _is_rendered(data, ["train"]):
+                self.attempt(run.feature_cache.needs, model, data)
 
-    def check_data(self, run: "Train", data: "PhotographsDataModule") -> bool:
-        """Record missing data of a run and return whether all files exist."""
+    def check_data(self, run: "Train") -> None:
+        """Look for all files of the data, and read a batch if none is missing."""
+        data = self.attempt(build_data, run)
         split = run.evaluation.split
-        dataset = data.dataset
-        if hasattr(dataset, "cache_dir") and not _is_rendered(data, {"train", "val", split}):
-            self.notes[f"data={dataset.name}: people are rendered before the first step"] = None
-            return False
+        if data is None or (
+            hasattr(data.dataset, "cache_dir") and not _is_rendered(data, ["train", "val", split])
+        ):
+            return
         chamfer = getattr(getattr(run.loss, "weights", None), "chamfer", None)  # plug-ins may lack it
         expected = f"expected body vertices for loss.weights.chamfer={chamfer} (0 does without); found none"
-        keys = [(config_hash(run.plain["data"], without=()), phase) for phase in ("train", split)]
-        for key in keys:
-            phase = key[1]
-            if key not in self.complete and phase in dataset.split_names:
-                bodies = expected if chamfer and phase == "train" else None
-                lines = self.attempt(_find_missing_files, dataset, phase, bodies)
-                self.reasons |= dict.fromkeys(lines or ())
-                self.complete[key] = lines == []
-        if not all(self.complete.get(key, True) for key in keys):
-            return False
+        before = len(self.reasons)
+        for phase in dict.fromkeys(("train", split)):
+            if phase not in data.dataset.split_names:
+                continue
+            bodies = expected if chamfer and phase == "train" else None
+            lines = self.attempt(_find_missing_files, data.dataset, phase, bodies)
+            self.reasons |= dict.fromkeys(lines or ())
+        if len(self.reasons) > before:
+            return
         batch = self.attempt(data.training_batch, 0)  # also reads the contents of files
         self.attempt(check_evaluation, run, data)
         if chamfer and batch is not None and batch.body_vertices is None:
             place = data.photographs("train").reader.body_place(batch.subjects[0])
             self.reasons[f"{place}: {expected}"] = None
-        return True
 
 
 def _find_missing_files(dataset: "DataSet", phase: str, bodies: str | None) -> list[str]:
@@ -151,11 +155,11 @@ def _summarize(lines: Iterable[str]) -> list[str]:
 
 
 def plan(run: "Train") -> None:
-    """Print the plan of a single run, see :func:`ghgs_lit.runs.plan.print_plan`.
+    """Print the plan of a single run, see :func:`ghgs_lit.runs.sweep.print_plan`.
 
     Raises:
         InputError: Something is missing.
     """
     directory = RunDirectory(output_dir()).of(run)
-    item = PlannedRun(directory.path.name, (), tuple(overrides()), run, directory)
+    item = PlannedRun((), tuple(overrides()), run, directory)
     print_plan([item], directory.path, rehearse)

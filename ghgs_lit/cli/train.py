@@ -24,14 +24,7 @@ from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import format_means, measure_and_write
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.processes import (
-    Interrupted,
-    in_srun,
-    interruptible,
-    print_how_to_go_on,
-    queue_again,
-    settle_rank,
-)
+from ghgs_lit.runs.processes import Interrupted, in_srun, interruptible, print_how_to_go_on, settle_rank
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import GHGSModule, loggers, start
@@ -179,12 +172,8 @@ def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float
         with interruptible():
             return (job.train_once if is_first else job.join_training)(directory, run, train)
     except Interrupted as stop:
-        if rank_zero_only.rank == 0 and not stop.explained:
-            place = f"hydra.run.dir={directory.path}"
-            if job.in_sweep():
-                place = f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
-            how = f"to go on, the same command with {place}"
-            print_how_to_go_on(stop, str(directory.path), how, queue_again(stop.number))
+        if rank_zero_only.rank == 0 and not job.in_sweep():
+            print_how_to_go_on(stop, str(directory.path), f"hydra.run.dir={directory.path}")
         raise
 
 
@@ -325,8 +314,7 @@ def measure_last(
         sessions=RunDirectory(directory).sessions(),
     )
     summary = read_results(path)["summary"]
-    changes = RunDirectory(directory).swept or overrides()
-    values = loggers.hyperparameters(run.plain, choices(), changes)
+    values = loggers.hyperparameters(run.plain, choices(), overrides())
     table = format_means(summary, "github")
     loggers.log_results(trainer.loggers, values, summary, table, trainer.global_step)
     announce(path)

@@ -1,5 +1,6 @@
 """Training jobs: lock a run that is free and unfinished, then train or resume it."""
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,13 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.compose import to_plain
 from ghgs_lit.config.defaults import fill
-from ghgs_lit.config.keys import lookup
+from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.results import config_hash
-from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, find_runs_of_job
+from ghgs_lit.runs.run import AUTO, CURVES, MARKER, PLAN, RunDirectory, find_runs_of_job
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 BUSY = "busy"  #: Return value of a job whose run is locked by another process
 _PATIENCE = 300.0  # seconds to wait for the first of several processes to begin
 _TASK = "hydra.overrides.task"  # key of a sweep's command-line overrides in its multirun.yaml
-SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 
 Train = Callable[[Run, Path, dict[str, Any]], float | None]
 """Function ``(run, directory, stats) -> metric``; it fills ``stats`` for ``sessions.jsonl``."""
@@ -38,10 +38,26 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def _must_wait() -> bool:
-    """Whether to wait for a locked run: the grid sweeper retries it later, other sweepers need its result
-    now."""
-    return in_sweep() and HydraConfig.get().sweeper.get("_target_") != SWEEPER
+def find_curves(directory: Path) -> Path:
+    """Folder of a run's TensorBoard files, ``tensorboard`` or, in a sweep, a folder in it. Its name,
+    which TensorBoard shows, is made of the overrides that distinguish the run from the others.
+
+    Args:
+        directory: Directory of the run.
+
+    Returns:
+        The folder in which the run's files are, if any, whatever the sweep's present command.
+    """
+    folder = directory / "tensorboard"
+    begun = [path.parent for pattern in CURVES for path in directory.glob(pattern)]
+    if begun or not in_sweep():
+        return begun[0] if begun else folder
+    hydra = HydraConfig.get()
+    plan = Path(hydra.sweep.dir, PLAN)
+    shared = lookup(read_yaml(plan), _TASK) if plan.is_file() else ()
+    changes = [text for text in hydra.overrides.task if text not in shared]
+    changes = [text for text in changes if is_hyperparameter(key_of(text))]
+    return folder / ",".join(changes).replace(os.sep, "_")[-200:]
 
 
 def register_resolvers() -> None:
@@ -98,7 +114,7 @@ def train_once(directory: RunDirectory, run: "Training", train: Train) -> float 
     """
     directory = directory.of(run)
     path = directory.path
-    with directory.claim(wait=_must_wait()) as claimed:
+    with directory.claim() as claimed:
         if not claimed and in_sweep():
             print(f"skipped: {directory.owner} works on {path}", flush=True)
             return BUSY

@@ -65,19 +65,6 @@ def in_srun() -> bool:
     return is_task and os.environ.get("SLURM_JOB_NAME") not in ("bash", "interactive")
 
 
-def launch_id() -> str | None:
-    """Identifier shared by all processes that were started together: the job step or torchrun's run ID,
-    with the number of restarts; None without a launcher."""
-    names = {
-        "TORCHELASTIC_RUN_ID": ("TORCHELASTIC_RUN_ID", "TORCHELASTIC_RESTART_COUNT"),
-        "SLURM_STEP_ID": ("SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_RESTART_COUNT"),
-    }
-    for first, all_of_them in names.items():
-        if first in os.environ:
-            return ".".join(os.environ.get(name, "0") for name in all_of_them)
-    return None
-
-
 def slurm_job() -> str | None:
     """ID of the SLURM job, which is kept when the job is requeued; None outside SLURM."""
     array = os.environ.get("SLURM_ARRAY_JOB_ID")
@@ -238,16 +225,17 @@ def _pass_on(number: int, handler: Any) -> None:
             handler(number, None)
 
 
-def print_how_to_go_on(stop: Interrupted, what: str, how: str, is_queued: bool) -> None:
-    """Print to stderr what was stopped and how to continue, and mark the interruption as explained.
+def print_how_to_go_on(stop: Interrupted, what: str, where: str) -> None:
+    """Requeue the SLURM job if its time is up, print how what was stopped continues, and mark the
+    interruption as explained.
 
     Args:
         stop: The interruption.
         what: What was stopped.
-        how: How to continue it, in words; replaced if SLURM has requeued the job.
-        is_queued: Whether SLURM will run it again.
+        where: Override with which the same command continues it.
     """
     stop.explained = True
-    name = signal.Signals(stop.number).name
-    how = "SLURM queues its job again" if is_queued else how
-    print(f"ghgs: {what} was interrupted ({name}); {how}", file=sys.stderr)
+    how = f"to go on, the same command with {where}"
+    if queue_again(stop.number):
+        how = "SLURM queues its job again"
+    print(f"ghgs: {what} was interrupted ({signal.Signals(stop.number).name}); {how}", file=sys.stderr)

@@ -12,17 +12,15 @@ import datetime
 import json
 import os
 import re
-import shutil
 import socket
 import uuid
-from collections.abc import Iterable, Iterator
-from enum import StrEnum
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
 
-from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
+from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import (
@@ -35,7 +33,7 @@ from ghgs_lit.files import (
     write_text_atomically,
 )
 from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
-from ghgs_lit.runs.processes import is_queued_again, launch_id, slurm_job
+from ghgs_lit.runs.processes import is_queued_again, slurm_job
 from ghgs_lit.runs.results import config_hash, differences, read_results, validate
 
 if TYPE_CHECKING:
@@ -43,6 +41,10 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  #: Value of ``resume``: continue the run in the directory, if any
 MARKER = "run.json"
+SESSIONS = "sessions.jsonl"
+PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, in the sweep's folder
+#: TensorBoard's files; in a sweep they are in a folder named after overrides.
+CURVES = ("tensorboard/events.out.tfevents.*", "tensorboard/*=*/events.out.tfevents.*")
 #: Files that training writes into a run's directory and that a new run deletes, apart from checkpoints of
 #: other names and Hydra's logs; other files in these folders belong to the user.
 _FILES = (
@@ -54,12 +56,9 @@ _FILES = (
     "metrics.json",
     "pictures/model_v*.png",
     "pictures/step_*/*.png",
-    "tensorboard/events.out.tfevents.*",
+    *CURVES,
 )
 WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Their top-level names
-_CURVES = "tb"  #: Folder of a sweep with the TensorBoard files of its runs
-SESSIONS = "sessions.jsonl"
-PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, in the sweep's folder
 
 
 class Identity(BaseModel):
@@ -68,7 +67,6 @@ class Identity(BaseModel):
     Attributes:
         id: ID of the run, which is kept when the run is moved; external loggers use it, too.
         config_hash: Hash of the configuration.
-        settings_hash: Hash of the configuration without keys that may change on resuming.
         resume: Value of ``resume`` that the run began with.
         job: SLURM job that last worked on the run.
     """
@@ -76,13 +74,8 @@ class Identity(BaseModel):
     model_config = ConfigDict(strict=True)
     id: str
     config_hash: str
-    settings_hash: str
     resume: str | None
     job: str | None
-
-
-#: File with the overrides that distinguish a run from the other runs of its grid.
-SWEPT = "swept.json"
 
 
 def runs_in_order(sweep: Path) -> list[str]:
@@ -93,16 +86,6 @@ def runs_in_order(sweep: Path) -> list[str]:
         if isinstance(names, list):
             return list(map(str, names))
     return []
-
-
-class State(StrEnum):
-    """State of a run."""
-
-    DONE = "done"
-    RUNNING = "running"
-    PARTIAL = "partial"  # to resume from its last checkpoint
-    FAILED = "failed"  # to start again
-    MISSING = "missing"
 
 
 class RunDirectory:
@@ -155,42 +138,13 @@ class RunDirectory:
         return path if path.is_file() else None
 
     @property
-    def state(self) -> State:
+    def state(self) -> str:
+        """``done``, ``running``, ``partial`` (to resume from its last checkpoint) or ``missing``."""
         if self.done:
-            return State.DONE
+            return "done"
         if is_locked(self._lock):
-            return State.RUNNING
-        sessions = self.sessions()
-        if sessions and sessions[-1].get("outcome") == "failed":
-            return State.FAILED
-        return State.PARTIAL if self.checkpoint else State.MISSING
-
-    @property
-    def swept(self) -> list[str]:
-        """Overrides that distinguish a run from the other runs of its grid; empty for a single run."""
-        path = self.path / SWEPT
-        texts = read_json(path) if path.is_file() else []
-        fits = isinstance(texts, list) and all(isinstance(text, str) and text.isprintable() for text in texts)
-        require(fits, str(path), "a list of overrides", texts)
-        return texts
-
-    @property
-    def title(self) -> str:
-        """Folder name made of :attr:`swept`, keys without their groups; limited to the last 200
-        characters."""
-        changes = (re.sub(r"^[^=]*\.", "", change) for change in self.swept)
-        return ",".join(changes).replace(os.sep, "_")[-200:].lstrip(".")
-
-    @property
-    def curves(self) -> Path:
-        """Folder of the TensorBoard files, whose name TensorBoard shows as the run's. For a run of a grid
-        it is named :attr:`title` and lies in the sweep's folder; its file ``.run`` holds the run's ID."""
-        if not (self.title and (self.path.parent / PLAN).is_file()):
-            return self.path / "tensorboard"
-        folder = self.path.parent / _CURVES / self.title
-        marker = self.marker
-        is_free = marker is None or _owner_of(folder) in (None, marker.id)
-        return folder if is_free else folder.with_name(f"{self.title},run={marker.id}")
+            return "running"
+        return "partial" if self.checkpoint else "missing"
 
     @property
     def owner(self) -> str:
@@ -198,16 +152,13 @@ class RunDirectory:
         return lock_owner(self._lock)
 
     @contextlib.contextmanager
-    def claim(self, wait: bool = False) -> Iterator[bool]:
+    def claim(self) -> Iterator[bool]:
         """Lock the run for this process (:func:`ghgs_lit.files.lock`).
-
-        Args:
-            wait: Wait while another process holds the lock.
 
         Yields:
             Whether this process holds the lock.
         """
-        with lock(self._lock, wait) as self._is_mine:
+        with lock(self._lock) as self._is_mine:
             try:
                 yield self._is_mine
             finally:
@@ -238,56 +189,42 @@ class RunDirectory:
             InputError: The directory holds another run or foreign files.
         """
         require_no_links(self.path, WRITTEN)
-        if self.curves.parent != self.path:
-            require_no_links(self.path.parent, (_CURVES, str(self.curves.relative_to(self.path.parent))))
         resume = run.resume
         given = None if resume == AUTO else resume
         if self._has(resume) or self.continues(run):
             checkpoint = resume if self._has(resume) else self.checkpoint
             return str(checkpoint) if checkpoint is not None else given
         owned = self.marker is not None
-        there = self._find_existing(*WRITTEN) if owned else self._find_existing(*WRITTEN, SESSIONS)
+        names = WRITTEN if owned else (*WRITTEN, SESSIONS)
+        there = [name for name in names if os.path.lexists(self.path / name)]
         if not there:
             return given
         if not (run.overwrite and owned):
-            raise InputError(f"{self.path}: {self._rejection(run, there[0], owned)}")
+            raise InputError(f"{self.path}: {self._rejection(run, there[0])}")
         for key, source in (("init_from", getattr(run, "init_from", None)), ("resume", resume)):
             require(not self._has(source), key, "a file outside the run that overwrite=true deletes", source)
         return given
 
     def continues(self, run: "Training") -> bool:
-        """Whether the same command began the run in this directory. In an incomplete run, the length of
-        training and the evaluation may differ."""
+        """Whether the same command began the run in this directory."""
         marker = self.marker
         if marker is None or run.resume is None or marker.resume != run.resume:
             return False
         if run.overwrite and not (is_queued_again() and marker.job == slurm_job()):
             return False
-        if marker.config_hash == config_hash(run.plain):
-            return True
-        is_complete = RunDirectory(self.path).done
-        return not is_complete and marker.settings_hash == config_hash(run.plain, MAY_CHANGE_ON_RESUME)
-
-    def _find_existing(self, *names: str) -> list[str]:
-        return [name for name in names if os.path.lexists(self.path / name)]
+        return marker.config_hash == config_hash(run.plain)
 
     def _has(self, path: str | None) -> bool:
         """Whether ``path`` is a file of this run."""
         return path not in (None, AUTO) and resolve_path(path).is_relative_to(self.path)
 
-    def _rejection(self, run: Run, there: str, owned: bool) -> str:
-        ways = "hydra.run.dir or hydra.sweep.subdir name another"
-        if self.checkpoint is not None:
-            ways += f", resume={self.checkpoint} goes on with its weights"
-        if not owned:
-            return f"expected a directory without a run or other files of these names; found {there} ({ways})"
-        with contextlib.suppress(InputError, FileNotFoundError):
+    def _rejection(self, run: Run, there: str) -> str:
+        with contextlib.suppress(InputError):
             changed = differences(read_yaml(self.path / "config.yaml"), run.plain)
-            if changed:
-                there = f"{there} of another configuration: {', '.join(changed[:3])}"
-        return (
-            f"expected a directory without a run; found {there} ({ways}, overwrite=true deletes a single run)"
-        )
+            there += f" of another configuration: {', '.join(changed[:3])}"
+        ways = "hydra.run.dir or hydra.sweep.subdir name another, resume=<checkpoint> goes on with its"
+        ways += " weights, overwrite=true deletes a single run"
+        return f"expected a directory without a run or other files of these names; found {there} ({ways})"
 
     def begin(self, run: "Training") -> "Training":
         """Turn the directory into that of a run, which this process must have claimed.
@@ -310,13 +247,10 @@ class RunDirectory:
         identity = Identity(
             id=known.id if known else uuid.uuid4().hex[:8],
             config_hash=config_hash(run.plain),
-            settings_hash=config_hash(run.plain, MAY_CHANGE_ON_RESUME),
             resume=known.resume if known else run.resume,
             job=slurm_job(),
         )
         write_text_atomically(self.path / MARKER, identity.model_dump_json(indent=1) + "\n")
-        if self.curves.parent != self.path:
-            write_text_atomically(self.curves / ".run", identity.id)
         return run.replace(resume=start)
 
     def _clear(self, run: "Training", with_sessions: bool) -> None:
@@ -325,38 +259,13 @@ class RunDirectory:
         names = (re.sub(r"\{.*?\}", "*", each["filename"]) for each in options if each and "filename" in each)
         patterns = [*_FILES, *(f"checkpoints/{name}.ckpt" for name in names), *[SESSIONS] * with_sessions]
         paths = [path for pattern in patterns for path in self.path.glob(pattern)]
-        marker = self.marker
-        if marker is not None and _owner_of(self.curves) == marker.id:
-            paths += [*self.curves.glob("events.out.tfevents.*"), self.curves / ".run"]
-        if paths and not (self._is_mine and marker is not None):
+        if paths and not (self._is_mine and self.marker is not None):
             raise RuntimeError(f"{self.path}: files are deleted in a run that this process has claimed only")
         for path in paths:
             path.unlink()
         for folder in {path.parent for path in paths} - {self.path}:
             with contextlib.suppress(OSError):  # it holds files of the user
                 folder.rmdir()
-
-    def discard(self, others: Iterable[str], since: float) -> None:
-        """Remove the directory if no run has begun in it: it contains only files written at startup,
-        those of a run and ``others``, and no process holds its lock.
-
-        Args:
-            others: Names of further files that may exist.
-            since: Time of startup in seconds since the epoch; if any file is older, nothing is removed.
-        """
-        known = {".lock", MARKER, "config.yaml", SESSIONS, *others}
-
-        def is_unused() -> bool:
-            paths = list(self.path.glob("*"))
-            if not paths:  # created at this startup unless it is older
-                return self.path.is_dir() and self.path.stat().st_mtime >= since
-            return all(p.name in known and p.lstat().st_mtime >= since for p in paths)
-
-        if self.path == Path.cwd() or not is_unused():
-            return
-        with self.claim() as mine:
-            if mine and is_unused():
-                shutil.rmtree(self.path, ignore_errors=True)
 
     def sessions(self) -> list[dict[str, Any]]:
         """One entry per process that worked on the run; entries of killed processes have no ``outcome``."""
@@ -382,7 +291,7 @@ class RunDirectory:
         """
         if self._has(resumed):
             resumed = str(resolve_path(resumed).relative_to(self.path))
-        process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch_id()}
+        process = {"host": socket.gethostname(), "pid": os.getpid()}
         self._log("started", **process, resumed=resumed)
         stats: dict[str, Any] = {}
         try:
@@ -394,10 +303,11 @@ class RunDirectory:
         self._log("ended", outcome="done", **stats)
 
     def find_first_session(self) -> dict[str, Any] | None:
-        """Current session of the first of the processes started together with this one, with the absolute
-        path of the checkpoint that it ``resumed`` from; None if it has not begun."""
+        """Current session of the first of several processes of this training, with the absolute path of
+        the checkpoint that it ``resumed`` from; None if it has not begun."""
         last = (self.sessions() or [{}])[-1]
-        if last.get("launch") != launch_id() or "outcome" in last or not is_locked(self._lock):
+        holder = f"process {last.get('pid')} on {last.get('host')}"
+        if "outcome" in last or self.owner != holder or not is_locked(self._lock):
             return None
         resumed = last["resumed"]
         return {**last, "resumed": resumed and str(self.path / resumed)}
@@ -405,11 +315,6 @@ class RunDirectory:
     def _log(self, moment: str, **facts: Any) -> None:
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
         append_line(self.path / SESSIONS, json.dumps({moment: now, **facts}))
-
-
-def _owner_of(curves: Path) -> str | None:
-    path = curves / ".run"
-    return path.read_text(errors="replace") if path.is_file() else None
 
 
 def find_runs_of_job(folder: Path, pattern: str) -> list[RunDirectory]:

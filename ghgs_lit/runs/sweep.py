@@ -1,59 +1,60 @@
 """Sweeps (``hydra/sweeper=grid``): plan the runs of a grid and launch the unfinished ones."""
 
-import contextlib
-import json
 import logging
-import re
-import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf, open_dict
+from tabulate import tabulate
 
 from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text, to_plain
 from ghgs_lit.config.defaults import fill
-from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.registry import verb_class
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_writable, resolve_path, write_text_atomically
-from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
-from ghgs_lit.runs.plan import PlannedRun, Rehearse, print_plan, print_states, shared_overrides
-from ghgs_lit.runs.processes import (
-    Interrupted,
-    interruptible,
-    print_how_to_go_on,
-    queue_again,
-    stop_if_interrupted,
-)
-from ghgs_lit.runs.results import config_hash, differences
-from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State, runs_in_order
+from ghgs_lit.runs.processes import Interrupted, interruptible, print_how_to_go_on, stop_if_interrupted
+from ghgs_lit.runs.results import config_hash
+from ghgs_lit.runs.run import PLAN, RunDirectory, runs_in_order
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Train
 
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between checks of runs locked by other processes
-#: Words in sbatch's error messages, with the launcher keys that they concern.
-_SBATCH_KEYS = {
-    "partition": ("partition",),
-    "gres": ("gres", "gpus_per_node", "gpus_per_task"),
-    "memory": ("mem_gb", "mem_per_cpu", "mem_per_gpu"),
-    "feature": ("constraint",),
-    "qos": ("qos",),
-    "account": ("account",),
-    "cpu": ("cpus_per_task", "cpus_per_gpu"),
-    "node": ("exclude", "nodelist", "nodes"),
-    "time": ("timeout_min",),
-}
+_OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a sweep.
+
+    Attributes:
+        overrides: Hydra overrides of the job, including those that set its directory.
+        shown: Overrides to print.
+        run: Configuration of the run.
+        directory: Directory of the run.
+    """
+
+    overrides: tuple[str, ...]
+    shown: tuple[str, ...]
+    run: "Train"
+    directory: RunDirectory
 
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
+Rehearse = Callable[[Sequence[PlannedRun]], Sequence[str]]
+"""Function that checks the prerequisites of runs and returns one line for everything that is missing."""
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
@@ -74,31 +75,19 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
     """
     config = sweeper.config
     directory = resolve_path(str(config.hydra.sweep.dir))
-    started: list[PlannedRun] = []
     try:
         with interruptible():
-            planned = _plan(sweeper, arguments, directory)
-            _print_differences(planned, directory)
+            planned = _make_plan(sweeper, arguments, directory)
+            _check(planned, config, directory)
             if config.get("dry_run"):
                 print_plan(planned, directory, rehearse)
                 return []
-            started = planned
             write_plan(planned, config, directory)
-            launch = partial(_submit, sweeper.launcher, config.hydra.launcher)
-            returns = run_all(planned, launch, sweeper.max_batch_size)
+            returns = run_all(planned, partial(_launch, sweeper.launcher), sweeper.max_batch_size)
     except Interrupted as stop:
-        if not stop.explained:
-            how = "nothing was run; to begin, the same command"
-            if started:
-                done = sum(item.directory.done for item in started)
-                how = f"{done} of {len(started)} runs are done; to go on, the same command with"
-                how += f" hydra.sweep.dir={directory}"
-            print_how_to_go_on(stop, "the sweep", how, queue_again(stop.number))
+        print_how_to_go_on(stop, "the sweep", f"hydra.sweep.dir={directory}")
         raise
-    metrics = [item.directory.metric for item in planned]
-    shown = ["" if metric is None else f"{metric:.2f}" for metric in metrics]
-    sessions = [str(len(item.directory.sessions())) for item in planned]
-    print_states(planned, {"PSNR": shown, "sessions": sessions})
+    print_states(planned)
     print(f"wrote {directory}", flush=True)
     for result in returns:
         _ = result.return_value  # raises what the job raised
@@ -126,17 +115,16 @@ def combinations(
     return batch
 
 
-def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[PlannedRun]:
-    """Distinct runs of a sweep, after all checks that are fast; writes nothing."""
+def _make_plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[PlannedRun]:
+    """Distinct runs of a sweep; writes nothing."""
     config, batch = sweeper.config, sweeper.max_batch_size
     require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     verb = verb_class(sweeper.verb)
     name = f"basic for ghgs {sweeper.verb}, which is not derived from ghgs train"
     require(issubclass(verb, verb_class("train")), "hydra/sweeper", name, "grid")
     loader = sweeper.hydra_context.config_loader
-    combos = combinations(sweeper.params, arguments, loader)
     planned: dict[str, PlannedRun] = {}
-    for overrides in combos:
+    for overrides in combinations(sweeper.params, arguments, loader):
         stop_if_interrupted()
         cfg = loader.load_sweep_config(config, list(overrides))
         check_ablation(cfg, cfg.hydra)
@@ -149,20 +137,14 @@ def _plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> l
         name = config_hash(run.plain)
         # The job writes to the planned directory, whatever job number the launcher assigns.
         places = {"dir": str(directory), "subdir": subdirectory}
-        fixed = (f"hydra.sweep.{key}={_quote(place)}" for key, place in places.items())
+        fixed = (
+            f"hydra.sweep.{key}={QuotedString(text, Quote.single).with_quotes()}"
+            for key, text in places.items()
+        )
         place = RunDirectory(directory / subdirectory, name)
-        shown = tuple(filter_overrides(overrides))
-        planned.setdefault(name, PlannedRun(name, (*overrides, *fixed), shown, run, place))
-    if len(planned) < len(combos):
-        print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
-    runs = list(planned.values())
-    _check(runs, config, directory)
-    return runs
-
-
-def _quote(text: str) -> str:
-    """Quote text as the value of an override."""
-    return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text) + "'"
+        item = PlannedRun((*overrides, *fixed), tuple(filter_overrides(overrides)), run, place)
+        planned.setdefault(name, item)
+    return list(planned.values())
 
 
 def _check(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
@@ -182,45 +164,56 @@ def _check(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -
         check_config(item.run)
 
 
-def _print_differences(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print the keys that differ if the directory holds a sweep to which none of these runs belongs: the
-    user has probably changed a key by mistake."""
-    if any(item.directory.swept for item in planned):
-        return
-    others = []
-    for path in sorted(directory.glob(f"*/{SWEPT}")):
-        with contextlib.suppress(InputError, OSError):  # a damaged run does not belong to this sweep
-            others.append(differences(read_yaml(path.with_name("config.yaml")), planned[0].run.plain))
-    if keys := min(others, key=len, default=[]):
-        shown = ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
-        print(
-            f"none of these runs was begun; {len(others)} others in {directory} differ: {shown}", flush=True
-        )
+def print_states(planned: Sequence[PlannedRun]) -> None:
+    """Print a table of the runs, and the number of runs in each state."""
+    overrides = [item.shown for item in planned]
+    shared = set.intersection(*map(set, overrides)) if len(planned) > 1 else set()
+    states = [item.directory.state for item in planned]
+    table = {
+        "run": [item.directory.path.name for item in planned],
+        "state": states,
+        "steps": [item.run.trainer.max_steps for item in planned],
+        "PSNR": [item.directory.metric for item in planned],
+        "overrides": [" ".join(text for text in texts if text not in shared) for texts in overrides],
+    }
+    print(tabulate(table, "keys", floatfmt=".2f", disable_numparse=[0, 4]))
+    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(sorted(states)))
+    print(f"{len(planned)} runs: {counts}", flush=True)
+
+
+def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
+    """Print runs with their states, where they write, and everything that is missing.
+
+    Args:
+        planned: All runs of a sweep, or a single run.
+        directory: Directory of the sweep or of the run.
+        rehearse: Checks the prerequisites of the unfinished runs.
+
+    Raises:
+        InputError: Something is missing.
+    """
+    reasons = rehearse([item for item in planned if not item.directory.done])
+    print_states(planned)
+    print(f"nothing was run; outputs below {directory}: {_OUTPUTS}")
+    for reason in reasons:
+        print(f"would be refused: {reason}", flush=True)
+    if reasons:
+        found = f"found {len(reasons)} missing, as said above"
+        raise InputError(f"dry_run: expected runs that lack nothing; {found}")
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Write each run's configuration, from which tables list planned runs, and the overrides that
-    distinguish it from the other runs.
+    """Write each run's configuration, from which tables list planned runs.
 
     Args:
         planned: All runs of the sweep.
         config: Configuration of the command; saved in ``multirun.yaml``, which also lists the runs.
         directory: Directory of the sweep.
     """
-    shared = shared_overrides(planned)
-    titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
     for item in planned:
-        place = item.directory
-        if not (place.path / "config.yaml").exists():
-            write_text_atomically(place.path / "config.yaml", saved_text(item.run.plain))
-        if place.swept:
-            continue
-        swept = [o for o in item.shown if is_hyperparameter(key_of(o))]
-        swept = [o for o in swept if key_of(o) == "seed" or o not in shared] or [f"run={item.name}"]
-        write_text_atomically(place.path / SWEPT, json.dumps(swept))
-        if place.title in titles:  # taken by a grid with other settings in the same folder
-            write_text_atomically(place.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
-        titles.add(place.title)
+        path = item.directory.path / "config.yaml"
+        if not path.exists():
+            write_text_atomically(path, saved_text(item.run.plain))
     names = dict.fromkeys([*(item.directory.path.name for item in planned), *runs_in_order(directory)])
     runs = OmegaConf.to_yaml({"runs": list(names)})
     write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config) + runs)
@@ -249,55 +242,23 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
         for jobs in (todo[first : first + size] for first in range(0, len(todo), size)):
             results = launch([item.overrides for item in jobs], len(returns))
             for item, result in zip(jobs, results, strict=True):
-                if result.status == JobStatus.FAILED:
-                    try:
-                        error = result.return_value
-                    except Exception as raised:
-                        error = f"{type(raised).__name__}: {raised}".splitlines()[0]
-                    log.error("failed: %s (%s): %s", item.directory.path, " ".join(item.shown), error)
-                elif result.return_value == BUSY:
+                if result.status == JobStatus.COMPLETED and result.return_value == BUSY:
                     busy.append(item)
                     continue
                 returns.append(result)
+                if result.status == JobStatus.FAILED:
+                    log.error("failed: %s: %s", item.directory.path, result._return_value)
         if todo := busy:
             print(f"waiting for {', '.join(item.directory.owner for item in todo)}", flush=True)
-        while todo and all(item.directory.state == State.RUNNING for item in todo):
+        while todo and all(item.directory.state == "running" for item in todo):
             time.sleep(_POLL)
     return returns
 
 
-def _submit(
-    launcher: Launcher, options: DictConfig, jobs: Sequence[Sequence[str]], first: int
-) -> Sequence[JobReturn]:
-    """Launch jobs and wait for them; an error of sbatch becomes one line with the launcher's key."""
-    if not type(launcher).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
-        return launcher.launch(jobs, first)
-    if type(launcher).__name__ == "SlurmLauncher":
-        _check_accounting()
+def _launch(launcher: Launcher, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
+    """Launch jobs and wait for them; an error of the batch system becomes one line."""
     try:
         return launcher.launch(jobs, first)
-    except (RuntimeError, ValueError) as error:
-        is_rejected = isinstance(error.__cause__, subprocess.CalledProcessError)
-        lines = [line.removeprefix("sbatch: error: ") for line in str(error).splitlines()]
-    found = "; ".join(lines[:2])
-    if not is_rejected:
-        logs = options.submitit_folder.replace("%j", "*")
-        raise InputError(
-            f"hydra.launcher: expected jobs that end with a result; found {found} (logs: {logs})"
-        )
-    about = (keys for word, keys in _SBATCH_KEYS.items() if re.search(rf"\b{word}", found, re.IGNORECASE))
-    key = next((key for key in next(about, ()) if options.get(key) is not None), None)
-    where = "hydra.launcher" if key is None else f"hydra.launcher.{key}={options[key]}"
-    raise InputError(f"{where}: expected what sbatch accepts; found {found}")
-
-
-def _check_accounting() -> None:
-    """Keep submitit from polling ``sacct`` where SLURM has no accounting."""
-    with contextlib.suppress(OSError):
-        answer = subprocess.run(["sacct", "--noheader"], check=False, capture_output=True, text=True)
-        if answer.returncode != 0:
-            from submitit import SlurmJob
-
-            SlurmJob.watcher._make_command = lambda: None
-            message = " ".join(answer.stderr.split()) or "sacct fails"
-            print(f"note: {message}: the sweep waits for jobs that are cancelled, too", flush=True)
+    except RuntimeError as error:  # by submitit
+        found = "; ".join(str(error).splitlines()[:2])
+        raise InputError(f"hydra.launcher: expected jobs that end with a result; found {found}") from error

@@ -15,6 +15,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.errors import import_optional
 from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
+from ghgs_lit.runs.job import find_curves
 from ghgs_lit.runs.run import RunDirectory
 
 #: Metrics by which runs are compared; ``metrics.json`` contains all.
@@ -101,12 +102,12 @@ class CsvOptions(Options):
 
 
 class TensorBoardOptions(Options):
-    """TensorBoard's event files in ``<run>/tensorboard``; for a run of a sweep in
-    ``<sweep>/tb/<its settings>``, as TensorBoard names runs by their folders."""
+    """TensorBoard's event files in ``<run>/tensorboard``; for a run of a sweep in a folder there that is
+    named after its settings, as TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
         """Create the logger of the run in ``save_dir``."""
-        return TensorBoardLog(RunDirectory(Path(save_dir)).curves, name="", version="")
+        return TensorBoardLog(find_curves(Path(save_dir)), name="", version="")
 
 
 class WandbLog(WandbLogger):
@@ -215,7 +216,7 @@ def hyperparameters(
 
     Args:
         choices: the selected option of each config group.
-        overrides: for a run of a sweep those that distinguish it, otherwise all.
+        overrides: of the command line.
 
     Returns:
         Values by key; lists and dicts are converted to text."""

@@ -16,10 +16,9 @@ from ghgs_lit.config.registry import verb_class
 from ghgs_lit.config.run import Run
 from ghgs_lit.runs import job as job_module
 from ghgs_lit.runs.job import register_resolvers, train_once
-from ghgs_lit.runs.plan import PlannedRun, Rehearsal
 from ghgs_lit.runs.results import config_hash, provenance, write_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.sweep import run_all
+from ghgs_lit.runs.sweep import PlannedRun, run_all
 
 register_resolvers()
 
@@ -41,7 +40,7 @@ def record_execution(run: Run, directory: Path, stats: dict[str, Any]) -> float:
 
 def rehearse_nothing(monkeypatch) -> None:
     """Make ``dry_run`` rehearse nothing, for tests of the plan only."""
-    monkeypatch.setattr("ghgs_lit.cli.rehearsal.rehearse", lambda configs: Rehearsal())
+    monkeypatch.setattr("ghgs_lit.cli.rehearsal.rehearse", lambda planned: [])
 
 
 def executed(sweep: Path) -> list[str]:
@@ -81,14 +80,13 @@ def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
     for seed in range(count):
         run = base.replace(seed=seed)
         name = config_hash(run.plain)
-        planned.append(PlannedRun(name, (str(seed),), (), run, RunDirectory(sweep / name)))
+        planned.append(PlannedRun((str(seed),), (), run, RunDirectory(sweep / name, name)))
     return planned
 
 
 def work_through(sweep: Path, count: int, barrier) -> None:
     """One of several processes that work on the same grid, run by run."""
     job_module.in_sweep = lambda: True
-    job_module._must_wait = lambda: False
     items = plan_seeds(sweep, count)
 
     def slow(run, directory, stats):

@@ -14,7 +14,7 @@ from ghgs_lit.config.compose import saved_text
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job
 from ghgs_lit.runs.results import config_hash
-from ghgs_lit.runs.run import MARKER, PLAN, SWEPT, RunDirectory, State
+from ghgs_lit.runs.run import MARKER, RunDirectory
 from tests.helpers.jobs import hold_run, record_execution, write_finished_run
 from tests.helpers.processes import PREPARED
 
@@ -100,7 +100,7 @@ def test_two_configurations_do_not_share_a_directory(tmp_path, is_done):
     train_to_end(tmp_path / "run") if is_done else train_until_killed(tmp_path / "run")
     before = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
     with pytest.raises(
-        InputError, match=r"run: expected a directory without a run; found .* \(.*overwrite=true"
+        InputError, match=r"run: expected a directory without a run or .*; found .* \(.*overwrite=true"
     ):
         train_until_killed(tmp_path / "run", RUN.replace(seed=2))
     after = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
@@ -118,19 +118,6 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
     assert code == 1
     assert len(err.splitlines()) == 1
     assert "found metrics.csv of another configuration: seed: 1 -> 2 (" in err
-
-
-def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
-    """A shorter budget lets a run finish; results of a complete run are not replaced silently."""
-    longer = RUN.replace(trainer={**RUN.plain["trainer"], "max_steps": 8})
-    train_until_killed(tmp_path / "run")
-    assert train_until_killed(tmp_path / "run", longer) == [
-        str(tmp_path / "run" / "checkpoints" / "last.ckpt")
-    ]
-    assert train_to_end(tmp_path / "run", longer) == 20.5
-    with pytest.raises(InputError, match="expected a directory without a run"):
-        train_to_end(tmp_path / "run")
-    assert RunDirectory(tmp_path / "run").of(longer).done
 
 
 def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
@@ -197,41 +184,11 @@ def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
     assert len(RunDirectory(path).sessions()) == 1
 
 
-@pytest.mark.parametrize("swept", ['[".."]', '["../.."]', '["."]', '["a/../.."]'])
-def test_a_title_leads_out_of_no_folder(tmp_path, swept):
-    """Regression: overwriting an untrusted run of a sweep emptied the sweep's folder."""
-    path = tmp_path / "sweep" / "run"
-    train_until_killed(path)
-    for folder in (path.parent, path.parent / "tb"):
-        folder.mkdir(exist_ok=True)
-        (folder / ".run").write_text(RunDirectory(path).marker.id)
-        (folder / "events.out.tfevents.9").write_text("mine")
-    (path.parent / PLAN).write_text("{}")
-    (path / SWEPT).write_text(swept)
-    train_until_killed(path, RUN.replace(overwrite=True))
-    assert (path.parent / "events.out.tfevents.9").exists()
-    assert (path.parent / "tb" / "events.out.tfevents.9").exists()
-
-
-@pytest.mark.parametrize("text", ["null", "[1, 2]", '"a"', "{}", '["a\\u0000"]', "["])
-def test_a_damaged_title_is_one_line(verb, tmp_path, text):
-    train_until_killed(tmp_path / "run")
-    (tmp_path / PLAN).write_text("{}")
-    (tmp_path / "run" / SWEPT).write_text(text)
-    code, _, err = verb(f"hydra.run.dir={tmp_path / 'run'}", "overwrite=true")
-    assert (code, len(err.splitlines())) == (1, 1), err
-    assert str(tmp_path / "run" / SWEPT) in err
-
-
-@pytest.mark.parametrize("place", ["pictures", "checkpoints", "faults", "../tb", "../tb/seed=2"])
+@pytest.mark.parametrize("place", ["pictures", "checkpoints", "faults", "tensorboard/seed=2"])
 def test_nothing_is_written_through_links(verb, tmp_path, place):
     """Regression: pictures were written to the target of a link."""
     run, outside = tmp_path / "sweep" / "run", tmp_path / "outside"
     outside.mkdir()
-    if ".." in place:
-        run.mkdir(parents=True)
-        (run / SWEPT).write_text('["seed=2"]')
-        (run.parent / PLAN).write_text("{}")
     (run / place).parent.mkdir(parents=True, exist_ok=True)
     (run / place).symlink_to(outside)
     code, _, err = verb(f"hydra.run.dir={run}", "seed=2")
@@ -308,7 +265,7 @@ def test_the_loser_of_two_starts_leaves_the_winner_alone(verb, tmp_path):
         assert code == 1
         assert f"found process {holder.pid} on" in err
         assert (run / "config.yaml").read_text() == "of the winner"
-        assert RunDirectory(run).state == State.RUNNING
+        assert RunDirectory(run).state == "running"
     finally:
         holder.kill()
         holder.join()
