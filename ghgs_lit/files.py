@@ -202,18 +202,12 @@ def _remove_leftovers(path: Path) -> None:
     prefix = f".{path.name}.{socket.gethostname()}."
     for leftover in path.parent.glob(f"{prefix}*.tmp"):
         number = leftover.name.removeprefix(prefix).removesuffix(".tmp")
-        if number.isdecimal() and not _is_running(int(number)):
+        try:
+            os.kill(int(number), 0)
+        except ProcessLookupError:
             leftover.unlink(missing_ok=True)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+        except (ValueError, PermissionError):  # not a process ID; a process of another user
+            continue
 
 
 def _sync(place: Path) -> None:
@@ -284,8 +278,13 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
     if path in _HELD:
         yield False
         return
-    handle, locked = _open_locked(path, wait)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = _open_lock(path, os.O_RDWR | os.O_CREAT)
     try:
+        locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
+        if not locked:  # is_locked() in another process holds it briefly
+            time.sleep(0.05)
+            locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
         if locked:
             _HELD.add(path)
             os.ftruncate(handle, 0)
@@ -294,25 +293,6 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
     finally:
         os.close(handle)
         _HELD.discard(path)
-
-
-def _open_locked(path: Path, wait: bool) -> tuple[int, bool]:
-    """File descriptor of the lock file, and whether the lock was acquired."""
-    while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = _open_lock(path, os.O_RDWR | os.O_CREAT)
-        try:
-            locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
-            if not locked:  # is_locked() in another process holds it briefly
-                time.sleep(0.05)
-                locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
-        except BaseException:
-            os.close(handle)
-            raise
-        with contextlib.suppress(FileNotFoundError):
-            if not locked or os.path.samestat(os.fstat(handle), os.stat(path)):
-                return handle, locked
-        os.close(handle)  # its previous owner has removed the file with its folder
 
 
 def is_locked(path: str | Path) -> bool:
@@ -355,14 +335,11 @@ def _try_lock(handle: int, kind: int, wait: bool, path: Path) -> bool:
 
     Raises:
         InputError: the file system has no locks.
-        OSError: any other error of the system.
     """
     try:
         fcntl.lockf(handle, kind | (0 if wait else fcntl.LOCK_NB))
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EAGAIN):
             return False
-        if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
-            raise InputError(f"{path}: expected a file system with locks; found {error}") from None
-        raise
+        raise InputError(f"{path}: expected a file system with locks; found {error}") from None
     return True

@@ -13,7 +13,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from ghgs_lit import files
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import (
     append_line,
@@ -181,22 +180,6 @@ def test_a_lock_file_that_is_another_file_is_refused_and_stays(tmp_path, kind, a
     with pytest.raises(InputError, match=r"\.lock: expected a lock file; found .*(link|another file)"):
         act(tmp_path / ".lock").__enter__()
     assert target.read_text() == "precious"
-
-
-def test_a_lock_whose_file_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
-    """Regression: two processes held it, one the removed file and one the new file."""
-    path, real = tmp_path / "run" / ".lock", files._try_lock
-    removals = [path.unlink, path.parent.rmdir]
-
-    def removed_first(*arguments):
-        while removals:
-            removals.pop(0)()
-        return real(*arguments)
-
-    monkeypatch.setattr(files, "_try_lock", removed_first)
-    with files.lock(path) as mine:
-        assert mine
-        assert path.read_text().endswith(f"{os.getpid()} on {socket.gethostname()}\n")
 
 
 def test_a_lock_is_not_made_where_a_link_leads(tmp_path):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 import torch
+from rich.progress import track
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.reports import pivot, print_tables, publish
@@ -17,7 +18,6 @@ from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
 from ghgs_lit.errors import require_choice
-from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import provenance
 from ghgs_lit.runtime.cores import allowed_cores
 
@@ -89,7 +89,7 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
         tasks: what to run.
         workers: number of processes; 0: this one.
     """
-    shown = track(tasks, "stages and families")
+    shown = track(tasks, "stages and families", transient=True)
     if workers == 0:
         return list(itertools.chain.from_iterable(map(measure_task, shown)))
     # Spawned: a forked child would inherit locks of threads that it does not have.

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
+from rich.progress import track
 from torch import Tensor
 
 from ghgs_lit.errors import InputError
@@ -17,7 +18,6 @@ from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.method.recalibration.inspection import Call, collect_calls, shared_neighbors
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.refinement import CameraRefinement, Refinement
-from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 from ghgs_lit.visualization.pictures import save_png, sheet
@@ -243,7 +243,7 @@ def measure_all(
         loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)
         measured: list[Row] = []
         for name, method in methods.items():
-            batches = track(loader, f"measuring {name}, {count} views")
+            batches = track(loader, f"measuring {name}, {count} views", transient=True)
             measured += measure(method, name, batches, metrics, device, pictures, picture_count)
         for kind in targets:
             rows += [row for row in measured if row["targets"] == kind]

@@ -1,5 +1,6 @@
 """Callbacks: progress of a run, its time and memory, and validation pictures."""
 
+import datetime
 import time
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,16 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Column
 
 from ghgs_lit.config.options import Index, Options
-from ghgs_lit.runs.progress import Lines, format_duration, on_terminal
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
 from ghgs_lit.types import Batch
 from ghgs_lit.visualization.pictures import save_png, sheet
+
+EVERY = 60.0  #: Seconds between two progress lines
 
 
 class ProgressOptions(Options):
@@ -33,8 +36,9 @@ class RunProgress(Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Open the log and start the bar."""
-        has_bar = on_terminal()
-        self._lines = Lines(Path(trainer.default_root_dir) / "train.log", printed=not has_bar)
+        has_bar = Console().is_terminal
+        self._log = Path(trainer.default_root_dir) / "train.log"
+        self._next = time.monotonic()  # of the next line
         text = TextColumn("{task.description}", table_column=Column())  # wraps on narrow terminals
         columns = (BarColumn(), TaskProgressColumn(), text)
         self._bar = Progress(*columns, disable=not (has_bar and trainer.is_global_zero))
@@ -47,12 +51,17 @@ class RunProgress(Callback):
         """Update the bar, and write a line if one is due."""
         step = trainer.global_step
         # Between two batches of an accumulated step nothing has changed.
-        is_due = trainer.is_global_zero and step > self._written and self._lines.is_due()
+        is_due = trainer.is_global_zero and step > self._written and time.monotonic() >= self._next
         if is_due or not self._bar.disable:  # reading a step's values is a synchronisation
             text = self._text(trainer, pl_module.used_budget)
             self._bar.update(self._task, completed=pl_module.used_budget, description=text)
         if is_due:
-            self._lines.write(text)
+            line = f"{datetime.datetime.now():%H:%M:%S} {text}"
+            if self._bar.disable:
+                print(line, flush=True)
+            with open(self._log, "a") as file:
+                file.write(line + "\n")
+            self._next = time.monotonic() + EVERY
             self._written = step
 
     def _text(self, trainer: L.Trainer, used: float) -> str:
@@ -66,7 +75,8 @@ class RunProgress(Callback):
         elif self._first is not None and used > self._first[2]:
             seconds = now - self._first[0]
             parts.append(f"{(step - self._first[1]) / seconds:.3g} steps/s")
-            parts.append(f"{format_duration(seconds * (1 - used) / (used - self._first[2]))} left")
+            remaining = seconds * (1 - used) / (used - self._first[2])
+            parts.append(f"{datetime.timedelta(seconds=round(remaining))} left")
         return "  ".join(parts)
 
     def on_train_end(self, *args: Any) -> None:

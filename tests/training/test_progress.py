@@ -5,7 +5,6 @@ import re
 import pytest
 from rich.console import ConsoleDimensions
 
-from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training.callbacks import RunProgress
 from tests.helpers.training import loader, module, trainer
 
@@ -13,7 +12,7 @@ from tests.helpers.training import loader, module, trainer
 def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     """The log of a batch job and train.log show the step, loss, steps per second, remaining time and
     validation."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.is_due", lambda _: True)
+    monkeypatch.setattr("ghgs_lit.training.callbacks.EVERY", 0.0)
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     lines = (tmp_path / "train.log").read_text().splitlines()
     assert len(lines) == 12
@@ -26,8 +25,8 @@ def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize("width", [80, 160])
 def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
     """A terminal shows the bar, wrapped if narrow, and train.log gets the lines."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
-    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.is_due", lambda _: True)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    monkeypatch.setattr("ghgs_lit.training.callbacks.EVERY", 0.0)
     monkeypatch.setattr("rich.console.Console.size", ConsoleDimensions(width, 25))
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     shown = " ".join(capsys.readouterr().out.split())
@@ -35,18 +34,9 @@ def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
     assert len((tmp_path / "train.log").read_text().splitlines()) == 12
 
 
-def test_the_lines_come_once_a_minute(monkeypatch):
+def test_the_lines_come_once_a_minute(tmp_path, monkeypatch):
     """The log of a run of days has thousands of lines, not millions."""
-    now = iter([0.0, 0.0, 30.0, 60.0, 90.0, 125.0])
-    monkeypatch.setattr("ghgs_lit.runs.progress.time.monotonic", lambda: next(now))
-    lines = Lines()
-    assert [lines.is_due() for _ in range(5)] == [True, False, True, False, True]
-
-
-def test_evaluation_says_how_far_it_is(capsys):
-    """A long evaluation without a terminal prints lines, too."""
-    assert list(track([1, 2, 3], "measuring", every=0.0)) == [1, 2, 3]
-    assert [line.split(" ", 1)[1] for line in capsys.readouterr().out.splitlines()] == [
-        "measuring: 1 of 3, 0:00:00",
-        "measuring: 2 of 3, 0:00:00",
-    ]
+    monkeypatch.setattr("ghgs_lit.training.callbacks.EVERY", 1e9)
+    trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
+    (line,) = (tmp_path / "train.log").read_text().splitlines()
+    assert "step 1 of 12" in line

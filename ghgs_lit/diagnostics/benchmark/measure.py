@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
+from rich.progress import track
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
@@ -21,7 +22,6 @@ from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.functional import decibels, squared_error
 from ghgs_lit.ops.attention import attend
 from ghgs_lit.ply import ply_bytes
-from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
 from ghgs_lit.runtime.watching import Stopwatch, Watcher, watch_block, watch_stages
@@ -282,7 +282,7 @@ def time_cases(
         repeats: number of further rounds, at least 1.
         device: of models and batches.
     """
-    for turn in track(range(-warmup, repeats), "rounds"):
+    for turn in track(range(-warmup, repeats), "rounds", transient=True):
         for number in np.roll(np.arange(len(records)), -turn):
             record = records[number]
             probe = SecondsProbe(device)
@@ -308,7 +308,7 @@ def record_cases(
         Measurements in the order of the cases.
     """
     records = [Record(case) for case in cases]
-    for batch in track(batches, "errors"):
+    for batch in track(batches, "errors", transient=True):
         for record in records:
             cost, result = inspect(record.case, batch, device)
             if record is records[0]:
