@@ -16,6 +16,7 @@ from ghgs_lit.data.batches import make_loader
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.mask_checks import (
     SEARCH,
+    find_equal_poses,
     find_mask_problem,
     make_silhouette,
     measure_height,
@@ -149,6 +150,11 @@ class _Subjects(Dataset):
 
     def _compare(self, report: SubjectReport, silhouettes: Mapping[Photo, Silhouette]) -> None:
         """Compare the masks of a subject; raises InputError about the worst one."""
+        ring = {photo[0]: one.extrinsics for photo, one in silhouettes.items() if photo[1] == RING_VIEW}
+        pair = find_equal_poses(ring)
+        if pair is not None:
+            place = self.reader.place(report.name, pair[1], RING_VIEW)
+            raise InputError(f"{place}: expected a camera of its own; found that of position {pair[0]}")
         report.tall = report.tall or measure_height(list(silhouettes.values()))
         report.agreement = SEARCH.shares(list(silhouettes.values()))
         least = min(report.agreement)

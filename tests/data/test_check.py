@@ -59,6 +59,12 @@ def black(root) -> None:
     Image.new("RGB", (42, 42)).save(root / "train/img/s0_008/0.jpg")
 
 
+def same_camera(root) -> None:
+    for kind in ("intrinsic", "extrinsic"):
+        folder = root / "train/parm"
+        shutil.copy(folder / f"s0_000/0_{kind}.npy", folder / f"s0_008/0_{kind}.npy")
+
+
 DISAGREE = "expected a mask that the others of its subject allow"
 DAMAGES = {
     "full mask": (lambda r: paint(r, lambda m: m | True), f"{PLACE}: .*not of the background; found 100%"),
@@ -71,6 +77,10 @@ DAMAGES = {
         DISAGREE,
     ),
     "intrinsics of another size": (lambda r: change(r, "intrinsic", lambda k: k * [[2], [2], [1]]), DISAGREE),
+    "the same camera twice": (
+        same_camera,
+        f"{PLACE}: expected a camera of its own; found that of position 0",
+    ),
     "black photograph": (black, f"{PLACE}: expected a photograph in the mask; found black"),
 }
 
