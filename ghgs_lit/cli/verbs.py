@@ -33,7 +33,7 @@ class Train(Training):
     allow_random_encoder: bool = False
     """Allow random weights in an encoder that is not trained, for experiments."""
     dry_run: bool = False
-    """Print which runs would start, their duration and their output paths, and run nothing."""
+    """Print which runs would start, their outputs and what is missing, and run nothing."""
 
     def run(self) -> object:
         if self.dry_run:
