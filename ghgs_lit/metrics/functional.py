@@ -160,12 +160,14 @@ def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) 
         target: sRGB; values outside [0, 1] are clamped.
 
     Returns:
-        Maps in [0, 1], 0 where the images are equal; float32, on the device of ``image``."""
+        Maps in [0, 1], 0 where the images are equal, NaN where one is NaN; float32, on the device of
+        ``image``."""
     maps = []
     for pair in zip(target, image, strict=True):
         arrays = [each.float().clamp(0, 1).permute(1, 2, 0).contiguous().cpu().numpy() for each in pair]
         values, *_ = flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False, computeMeanError=False)
-        maps.append(values[..., 0])
+        is_nan = np.isnan(arrays).any((0, -1))  # the package counts NaN as a colour
+        maps.append(np.where(is_nan, np.float32(np.nan), values[..., 0]))
     return torch.from_numpy(np.stack(maps)).to(image.device)
 
 

@@ -94,6 +94,9 @@ def test_equal_images_and_empty_regions_are_defined():
     assert torch.equal(psnr(image, image), torch.full((3,), PSNR_CAP))
     assert torch.allclose(ssim(image, image), torch.ones(3))
     assert flip_map(image, image).abs().max() == 0
+    lost = image.index_fill(0, torch.tensor([1]), torch.nan)
+    assert flip_map(lost, image).isnan().flatten(1).all(1).tolist() == [False, True, False]
+    assert flip_map(image, lost).isnan().flatten(1).any(1).tolist() == [False, True, False]
     assert psnr(image, image, nobody).isnan().all()
     assert not box_of(nobody).any()
     mean = image_mean()
