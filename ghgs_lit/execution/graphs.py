@@ -46,15 +46,14 @@ _caches: WeakSet = WeakSet()
 
 
 class GraphCache:
-    """Calls functions of tensors, and replays them as CUDA graphs after the first calls of a shape bucket.
+    """Calls functions of tensors, and replays them as CUDA graphs after the first call of a shape bucket,
+    which is eager: it fills caches, and a bucket that occurs once is not worth a capture.
 
     Graphs hold memory. If a call runs out of memory, all graphs of the process are freed, the call is
     repeated, and graphs are captured again later.
 
     Args:
         limit: largest number of graphs, at least 1; the least recently used one is evicted.
-        eager: number of eager calls of a bucket before it is captured: they fill caches, and a bucket
-            that occurs once is not worth a capture.
         backend: captures graphs; None: CUDA graphs.
         recent: number of buckets whose eager calls are remembered; None: 64 per graph. A bucket that
             recurs only after more buckets than there are graphs would be captured in vain.
@@ -65,11 +64,8 @@ class GraphCache:
         reasons: reasons why calls were not captured, each once.
     """
 
-    def __init__(
-        self, limit: int = 8, eager: int = 1, backend: CaptureBackend | None = None, recent: int | None = None
-    ):
+    def __init__(self, limit: int = 8, backend: CaptureBackend | None = None, recent: int | None = None):
         self.limit = limit
-        self.eager = eager
         self.recent = recent or 64 * limit
         self.backend = backend or CudaGraphs()
         self.counts: Counter[str] = Counter()
@@ -81,12 +77,12 @@ class GraphCache:
 
     def __reduce__(self) -> tuple:
         """Copies start without graphs."""
-        return type(self), (self.limit, self.eager, type(self.backend)(self.backend.device), self.recent)
+        return type(self), (self.limit, type(self.backend)(self.backend.device), self.recent)
 
     def clear(self) -> None:
         """Free all graphs."""
         self._graphs: OrderedDict[Hashable, _Graph] = OrderedDict()
-        self._seen: OrderedDict[Hashable, int] = OrderedDict()
+        self._seen: OrderedDict[Hashable, None] = OrderedDict()
         self._refused: set[Hashable] = set()
 
     def of_weights(self, state: ModelState) -> ModelState:
@@ -130,7 +126,7 @@ class GraphCache:
 
         Args:
             function: depends on ``inputs``, ``key`` and tensors with fixed addresses, and does not write
-                its inputs. The first calls of a bucket are eager, and so are all calls if the capture
+                its inputs. The first call of a bucket is eager, and so are all calls if the capture
                 fails, which is logged once.
             inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
                 hashable.
@@ -162,14 +158,15 @@ class GraphCache:
         return self._call_eagerly(function, inputs, written)
 
     def _is_due(self, bucket: Hashable) -> bool:
-        """Count a call of a bucket, and return whether it had its eager calls before."""
+        """Note a call of a bucket, and return whether it had its eager call before."""
         if bucket in self._refused:
             return False
-        before = self._seen.pop(bucket, 0)
-        self._seen[bucket] = before + 1
-        while len(self._seen) > self.recent:
+        is_known = bucket in self._seen
+        self._seen[bucket] = None
+        self._seen.move_to_end(bucket)
+        if len(self._seen) > self.recent:
             self._seen.popitem(last=False)
-        return before >= self.eager
+        return is_known
 
     def _capture(
         self,

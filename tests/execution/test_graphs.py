@@ -197,7 +197,8 @@ def test_what_cannot_be_replayed_stays_eager(function):
 
 def refusal(function, values):
     """Reason why a function is not captured on the pretend device."""
-    cache = GraphCache(backend=OperatorBackend(), eager=0)
+    cache = GraphCache(backend=OperatorBackend())
+    cache(function, values)
     with pytest.warns(UserWarning, match="not captured"):
         cache(function, values)
     return cache.reasons[-1]
