@@ -100,21 +100,18 @@ class CapturedStep:
         self.graphs = GraphCache(limit=32, recent=8)
         self.buckets: dict[tuple, Sizes] = {}
 
-    def may_capture(self, device: str) -> bool:
-        """Whether training steps on a type of device can be captured at all."""
-        known = isinstance(self.renderer, Renderer) and isinstance(self.losses, Losses)
-        known = known and not self.losses.weights.model_extra  # terms of a plug-in may do likewise
-        return known and self.predictor.options.capture == "auto" and device == self.graphs.backend.device
-
     def captures(self, batch: Batch, is_scaled: bool = False) -> bool:
         """Whether to try to capture a training step.
 
-        Requires a device with capture, ``model.capture=auto``, no tokens read from disk, and under
-        float16 autocast a scaled loss (``is_scaled``).
+        Requires a device with capture, ``model.capture=auto``, no renderer or term of the loss of a
+        plug-in, no tokens read from disk, and under float16 autocast a scaled loss (``is_scaled``).
         """
         device = batch.masks.device.type
         model = self.predictor.model
-        if not self.may_capture(device) or not model.training:
+        known = isinstance(self.renderer, Renderer) and isinstance(self.losses, Losses)
+        known = known and not self.losses.weights.model_extra
+        is_on = self.predictor.options.capture == "auto" and device == self.graphs.backend.device
+        if not (known and is_on and model.training):
             return False
         # A plug-in's encoder may not have the attribute.
         reads_disk = getattr(model.encoder, "keeps_features", False)

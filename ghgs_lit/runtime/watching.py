@@ -123,8 +123,8 @@ class Stopwatch(Watcher):
         self._open: list[Mark] = []
         self._spans: list[tuple[str, Mark, Mark]] = []
 
-    def begin(self, stage: str, inputs: Inputs = ((), {}), since: Mark | None = None) -> None:
-        self._open.append(time_mark(self.device) if since is None else since)
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        self._open.append(time_mark(self.device))
 
     def end(self, stage: str, result: Any = None) -> None:
         self._spans.append((stage, self._open.pop(), time_mark(self.device)))
