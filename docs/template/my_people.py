@@ -22,12 +22,12 @@ from ghgs_lit.errors import InputError, require
 class MyReader(Reader):
     """The photographs of one phase as they are stored."""
 
-    def __init__(self, folder: Path, limit: int | None = None, strict: bool = True) -> None:
+    def __init__(self, folder: Path, strict: bool = True) -> None:
         super().__init__(strict)
         self.folder = folder
         # CHANGE: every subject (a person, or a frame of one) and the numbers of its cameras.
         people = sorted(p for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
-        for person in people[:limit]:
+        for person in people:
             cameras = sorted(int(p.stem) for p in person.glob("*.png"))
             self.subjects[check_name(person.name)] = tuple(cameras)
         if not self.subjects:
@@ -70,11 +70,11 @@ class MyReader(Reader):
 
 @register("data", "my_people")
 class MyPeople(DataSet):
-    """The options. `root`, `limit`, `size` and so on are there already;
+    """The options. `root`, `size` and so on are there already;
     CHANGE: add fields of your own."""
 
     static_cameras: ClassVar[bool] = True  # CHANGE: False if there are views between the cameras
     ring: ClassVar[int] = 8  # CHANGE: number of cameras; inputs are evenly spaced among them
 
     def reader(self, phase: str, strict: bool = True) -> MyReader:
-        return MyReader(self.folder / phase, self.limit.of(phase), strict)
+        return MyReader(self.folder / phase, strict)

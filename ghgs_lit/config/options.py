@@ -33,7 +33,10 @@ _NOUNS = {
     "null": "null", "boolean": "true or false", "integer": "an integer", "number": "a number",
     "string": "a text", "array": "a list", "object": "a mapping",
 }  # fmt: skip
-_LIMITS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+_LIMITS = {
+    "minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<",
+    "multipleOf": "a multiple of",
+}  # fmt: skip
 
 
 def name_type(text: str) -> WithJsonSchema:

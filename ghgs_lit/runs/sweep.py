@@ -124,7 +124,8 @@ def _make_plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path)
     require(issubclass(verb, verb_class("train")), "hydra/sweeper", name, "grid")
     loader = sweeper.hydra_context.config_loader
     planned: dict[str, PlannedRun] = {}
-    for overrides in combinations(sweeper.params, arguments, loader):
+    grid = combinations(sweeper.params, arguments, loader)
+    for overrides in grid:
         stop_if_interrupted()
         cfg = loader.load_sweep_config(config, list(overrides))
         check_ablation(cfg, cfg.hydra)
@@ -144,6 +145,8 @@ def _make_plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path)
         place = RunDirectory(directory / subdirectory, name)
         item = PlannedRun((*overrides, *fixed), tuple(filter_overrides(overrides)), run, place)
         planned.setdefault(name, item)
+    if len(grid) > len(planned):
+        print(f"{len(grid)} combinations, {len(planned)} different configurations", flush=True)
     return list(planned.values())
 
 

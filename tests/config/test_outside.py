@@ -148,7 +148,7 @@ def test_a_file_may_say_where_and_what(monkeypatch, capsys, tmp_path):
     code, out, err = call(monkeypatch, capsys, "train", *command, "dry_run=true")
     assert (code, err) == (0, "")
     assert "2 runs: 2 missing" in out
-    assert f"outputs: {tmp_path}/sweep/" in out
+    assert f"outputs below {tmp_path}/sweep" in out
     _, out, _ = call(monkeypatch, capsys, "train", *command, "--cfg", "hydra")
     assert OmegaConf.create(out).hydra.job.env_set.A == "b"  # the command line may set all
 
