@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -242,10 +243,14 @@ def render_people(
         Number of newly rendered people.
 
     Raises:
-        InputError: ``root`` contains other data, a position is not on the rig, or people are invalid
-            (raised after all others are rendered).
+        InputError: ``root`` contains other data, a position is not on the rig, the script has no main
+            guard, or people are invalid (raised after all others are rendered).
         RuntimeError: a rendering process died.
     """
+    # A worker that imports a script without a main guard would wait for its parent forever.
+    is_imported = getattr(multiprocessing.current_process(), "_inheriting", False)
+    expected = '`if __name__ == "__main__":` around what a script does, or data.render_workers=0'
+    require(not is_imported, sys.argv[0], expected, None)
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)

@@ -172,8 +172,11 @@ def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float
         with interruptible():
             return (job.train_once if is_first else job.join_training)(directory, run, train)
     except Interrupted as stop:
-        if rank_zero_only.rank == 0 and not job.in_sweep():
-            print_how_to_go_on(stop, str(directory.path), f"hydra.run.dir={directory.path}")
+        if rank_zero_only.rank == 0:
+            place = f"hydra.run.dir={directory.path}"
+            if job.in_sweep():
+                place = f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
+            print_how_to_go_on(stop, str(directory.path), place)
         raise
 
 

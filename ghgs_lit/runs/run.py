@@ -221,7 +221,7 @@ class RunDirectory:
     def _rejection(self, run: Run, there: str) -> str:
         with contextlib.suppress(InputError):
             changed = differences(read_yaml(self.path / "config.yaml"), run.plain)
-            there += f" of another configuration: {', '.join(changed[:3])}"
+            there += f" of another configuration: {', '.join(changed[:3])}" * bool(changed)
         ways = "hydra.run.dir or hydra.sweep.subdir name another, resume=<checkpoint> goes on with its"
         ways += " weights, overwrite=true deletes a single run"
         return f"expected a directory without a run or other files of these names; found {there} ({ways})"

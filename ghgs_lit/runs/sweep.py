@@ -85,7 +85,8 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
             write_plan(planned, config, directory)
             returns = run_all(planned, partial(_launch, sweeper.launcher), sweeper.max_batch_size)
     except Interrupted as stop:
-        print_how_to_go_on(stop, "the sweep", f"hydra.sweep.dir={directory}")
+        if not stop.explained:  # by the run
+            print_how_to_go_on(stop, "the sweep", f"hydra.sweep.dir={directory}")
         raise
     print_states(planned)
     print(f"wrote {directory}", flush=True)

@@ -17,7 +17,7 @@ from ghgs_people import figures, jobs
 from ghgs_people.jobs import SyntheticSource, render_people
 from ghgs_people.scans import ScanSource
 from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
-from tests.helpers.processes import PREPARED
+from tests.helpers.processes import PREPARED, run_block
 
 SMALL = TINY.replace(positions=(0, 4, 8), views=(0, 3))
 
@@ -188,6 +188,30 @@ def test_workers_end_with_the_process_that_started_them(scans, tmp_path):
     while any(map(lives, workers)) and time.monotonic() < limit:
         time.sleep(0.05)
     assert not any(map(lives, workers))
+
+
+UNGUARDED = """
+import sys
+from pathlib import Path
+from ghgs_people.jobs import RenderOptions, render_people
+from ghgs_people.rig import Rig
+from ghgs_people.scans import ScanSource
+
+root, scans = map(Path, sys.argv[1:])
+render_people(root, {"train": ["s0", "s1"]}, ScanSource(scans), Rig(), RenderOptions(size=42), 0, workers=2)
+"""
+
+
+def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
+    """Workers run the script again, and would deadlock with their parent."""
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED)
+    argv = [str(path) for path in (script, tmp_path / "out", scans)]
+    run = f"import runpy, sys; sys.argv = {argv}; runpy.run_path({str(script)!r}, run_name='__main__')"
+    path = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    code, said = run_block(run, tmp_path, {**os.environ, **path})
+    assert code == 1
+    assert f'{script}: expected `if __name__ == "__main__":` around' in said
 
 
 def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeypatch):

@@ -118,6 +118,7 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
     assert code == 1
     assert len(err.splitlines()) == 1
     assert "found metrics.csv of another configuration: seed: 1 -> 2 (" in err
+    assert "found metrics.csv (" in verb(where, "resume=null")[2]
 
 
 def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):

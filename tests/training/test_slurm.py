@@ -68,7 +68,15 @@ def stop_with(number):
     return train
 
 
-@pytest.mark.parametrize("places", [("seed=3",), ("-m", "seed=3,4"), ("seed=3", "hydra.run.dir=mine")])
+@pytest.mark.parametrize(
+    "places",
+    [
+        ("seed=3",),
+        ("-m", "seed=3,4"),
+        ("-m", "seed=3,4", "hydra/sweeper=basic", "hydra.sweep.dir=mine"),
+        ("seed=3", "hydra.run.dir=mine"),
+    ],
+)
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, number):
     """The same command resumes in its directory, instead of starting anew or being rejected. SLURM itself
