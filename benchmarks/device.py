@@ -24,7 +24,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ghgs_lit.config import run_of
-from ghgs_lit.diagnostics.benchmark.measure import OTHER, TOTAL, top_level, watched
+from ghgs_lit.diagnostics.benchmark.measure import OTHER, TOTAL, top_level, watch_model
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.execution import Predictor
 from ghgs_lit.losses import Losses, LossWeights
@@ -66,7 +66,7 @@ class CountingProbe(Watcher):
 def forward(predictor: Predictor, batch: Batch, log: Log) -> Counts:
     """Counts of one prediction without gradients."""
     probe = CountingProbe(log)
-    with torch.no_grad(), watched(predictor.model, probe), probe.of(TOTAL):
+    with torch.no_grad(), watch_model(predictor.model, probe), probe.of(TOTAL):
         predictor(batch)
     stages = [probe.counts[name] for name in top_level(probe.counts)]
     rest = (sum(numbers) for numbers in zip(*stages, strict=True))

@@ -15,7 +15,7 @@ from benchmarks.gpu_data import loader, people, training
 from benchmarks.gpu_measure import Call, reason
 from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
-from ghgs_lit.diagnostics.benchmark.measure import TOTAL, SecondsProbe, top_level, watch_block, watched
+from ghgs_lit.diagnostics.benchmark.measure import TOTAL, SecondsProbe, top_level, watch_block, watch_model
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
@@ -68,7 +68,7 @@ def _measure_prediction(
             stages = {}
             if predictor.options.capture == "off":  # a probe prevents the capture of stages
                 probe = SecondsProbe(call.gpu.device)
-                with watched(predictor.model, probe), watch_block(TOTAL, probe):
+                with watch_model(predictor.model, probe), watch_block(TOTAL, probe):
                     run()
                 seconds = probe.seconds()
                 stages = {f"{stage}_ms": 1e3 * seconds[stage] for stage in top_level(seconds)}

@@ -74,7 +74,7 @@ class Descent:
 
         Args:
             renderer: renders the input views, with gradients.
-            seen: from :func:`seen_by`.
+            seen: from :func:`find_visible`.
             weights: weights of L1, 1 - SSIM and L1 of the silhouette.
         """
         with exact(self.start.means.device.type), torch.enable_grad():
@@ -124,14 +124,14 @@ class Refinement:
         Raises:
             InputError: the Gaussians do not belong to pixels of ``batch``.
         """
-        seen = seen_by(batch)
+        seen = find_visible(batch)
         search = Descent(gaussians, batch, self.changes)
         for _ in range(self.steps):
             search.step(self.renderer, seen)
         return search.gaussians
 
 
-def seen_by(batch: Batch) -> Seen:
+def find_visible(batch: Batch) -> Seen:
     """Input images on black, silhouettes [B, V, 1, H, W] and cameras."""
     return on_black(batch), coverage(batch)[:, :, None], batch.cameras
 

@@ -65,7 +65,7 @@ def render(
         InputError: shapes, cameras or options are inconsistent.
         BackendUnavailable: gsplat cannot run on this machine.
     """
-    settings = settings or made_for(gaussians)
+    settings = settings or make_settings(gaussians)
     require(0 < near < math.inf, "near", "a number of metres > 0", near)
     _check_inputs(gaussians, cameras)
     backend = resolve_backend(backend, gaussians.means.device)
@@ -84,7 +84,7 @@ def render(
         return dataclasses.replace(rendering, image=rendering.image + behind)
 
 
-def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
+def make_settings(gaussians: Gaussians, **settings) -> RasterSettings:
     """Settings that the Gaussians were predicted for: their ``low_pass`` and ``antialiased``, and
     further fields of :class:`RasterSettings` in ``settings``."""
     return RasterSettings(low_pass=gaussians.low_pass, antialiased=gaussians.antialiased, **settings)
@@ -131,7 +131,7 @@ class Renderer(Options):
     ) -> Rendering:
         """:func:`render` with these options; ``background``, if given, overrides the configured one."""
         background = self.background if background is None else background
-        settings = made_for(gaussians, alpha_max=self.alpha_max)
+        settings = make_settings(gaussians, alpha_max=self.alpha_max)
         return render(gaussians, cameras, self.backend, background, self.near, settings)
 
 

@@ -51,7 +51,7 @@ class Chart:
         """
         return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)[self.nearest].reshape(*self.shape, 3)
 
-    def shaded(self, texture: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    def shade(self, texture: np.ndarray, factor: np.ndarray) -> np.ndarray:
         """Multiply a texture by a factor on the surface.
 
         Args:
@@ -122,7 +122,7 @@ def chart(name: str) -> Chart:
     ones = np.ones(len(used))
     rows = np.arange(len(used))
     interpolation = sparse.csr_matrix((ones, (rows, used)), (len(used), body.vertex_count))
-    uv = _cropped(body.uv, box).astype(np.float64)
+    uv = _crop_charts(body.uv, box).astype(np.float64)
     for _ in range(recipe.levels):
         finer, quads = subdivide(quads, interpolation.shape[0])
         interpolation = finer @ interpolation
@@ -178,7 +178,7 @@ def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
     surface = body.surfaces["body"]
     margin = 0.0
     if name in ("head", "skin"):
-        uv = _cropped(body.uv, body.head_uv)
+        uv = _crop_charts(body.uv, body.head_uv)
         inside = ((uv > 0) & (uv < 1)).all(1)[surface.uv_quads].all(1)
         inside &= body.mean[surface.quads][..., 1].min(1) > 1.38  # the box also contains fingers
         return (surface[inside], body.head_uv) if name == "head" else (surface[~inside], (0, 0, 1, 1))
@@ -204,7 +204,7 @@ def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
     return surface, (*(corners.min((0, 1)) - margin), *(corners.max((0, 1)) + margin))
 
 
-def _cropped(uv: np.ndarray, box: Sequence[float]) -> np.ndarray:
+def _crop_charts(uv: np.ndarray, box: Sequence[float]) -> np.ndarray:
     """UV coordinates relative to a box (left, bottom, right, top)."""
     left, bottom, right, top = box
     return (uv - [left, bottom]) / [right - left, top - bottom]
@@ -213,7 +213,7 @@ def _cropped(uv: np.ndarray, box: Sequence[float]) -> np.ndarray:
 def _ear_corners(body: BodyModel) -> np.ndarray:
     """Which points [t] of the UV layout lie on the ears."""
     height, width, _ = body.head_masks.shape
-    uv = _cropped(body.uv, body.head_uv)
+    uv = _crop_charts(body.uv, body.head_uv)
     inside = ((uv > 0) & (uv < 1)).all(1)
     column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
     row = np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1)

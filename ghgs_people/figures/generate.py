@@ -62,7 +62,7 @@ class Character:
         cut = sample_haircut(self.look_rng, female)
         self.cut = under_hat(cut) if self.outfit.beanie else cut
 
-    def dressed(self, figure: Figure, spheres: Spheres) -> list[TexturedMesh]:
+    def dress(self, figure: Figure, spheres: Spheres) -> list[TexturedMesh]:
         """Create skin, clothes, hair and cap over a figure of this shape, the same in each call.
 
         Args:
@@ -111,7 +111,7 @@ def generate(seed: int, index: int, active: bool = False) -> Person:
         InputError: a number is negative.
     """
     person = Character(seed, index, active)
-    parts = person.dressed(person.first, occluding_spheres(person.first))
+    parts = person.dress(person.first, occluding_spheres(person.first))
     return person.placed(parts, person.first.posed, len(parts))
 
 
@@ -196,7 +196,7 @@ def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Gener
             field: [g], positive where the garment is.
             texture: [h, w, 3] uint8, without shadows.
         """
-        return piece.mesh(points, field, piece.shaded(texture, ambient_occlusion(piece, points, spheres)))
+        return piece.mesh(points, field, piece.shade(texture, ambient_occlusion(piece, points, spheres)))
 
     field = garments.top_field(upper.place, top)
     if top.tucked:
@@ -254,7 +254,7 @@ def skin_part(
         points = skin(piece.interpolation @ figure.rest, piece.weights, figure.transforms)
         field = np.ones(len(points))
         if name != "eyes":
-            texture = piece.shaded(texture, ambient_occlusion(piece, points, spheres))
+            texture = piece.shade(texture, ambient_occlusion(piece, points, spheres))
         if name == "skin":
             field = bare_field(piece.place, outfit)
             # skin below clothes must not pierce them

@@ -52,7 +52,7 @@ def top_level(names: Iterable[str]) -> list[str]:
     return [name for name in names if "." not in name and name not in (OTHER, TOTAL)]
 
 
-def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
+def watch_model(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
     """Context in which a probe is called when a stage of a model, or a part of one, begins and ends."""
     names = [*STAGES, *([] if isinstance(model.rounds, NoRounds) else [ROUNDS])]
     return watch_stages(model, {name: name for name in names} | PARTS, probe)
@@ -71,7 +71,7 @@ def forward(
         probe: is called when stages, the rendering and the whole begin and end.
     """
     probe = probe or Watcher()
-    with watched(predictor.model, probe), watch_block(TOTAL, probe):
+    with watch_model(predictor.model, probe), watch_block(TOTAL, probe):
         prediction = predictor(replace(batch, targets=None))
         with watch_block(RENDER, probe):
             rendering = renderer(prediction.gaussians, batch.targets.cameras)

@@ -52,7 +52,7 @@ def _surface(views: int, size: int, family: str, g: Generator) -> Values:
     return {**values, "gains": uniform(g, 0.7, 1.0, views, 3), "opacities": opacities}
 
 
-def _seen(v: Values) -> tuple[Gaussians, Batch]:
+def _make_surface_splats(v: Values) -> tuple[Gaussians, Batch]:
     """Splats of a pixel's size on the true surface of one case, and its input views times the gains."""
     one = {name: value[None] for name, value in v.items()}
     one["images"] = one["images"] * one["gains"][..., None, None]
@@ -63,13 +63,13 @@ def _seen(v: Values) -> tuple[Gaussians, Batch]:
 
 
 def _gains(v: Values) -> Values:
-    return {"logs": log_gains(*_seen(v))[0]}
+    return {"logs": log_gains(*_make_surface_splats(v))[0]}
 
 
 def _refine(v: Values) -> Values:
     """Renders after two steps; not Gaussians, since those that no view shows move by the sign of rounding."""
     backend = stages.backend_of(v["images"])
-    gaussians, batch = _seen(v)
+    gaussians, batch = _make_surface_splats(v)
     refined = Refinement(2, Renderer(backend=backend))(gaussians, batch)
     rendering = render(refined, batch.cameras, backend)
     return {"image": rendering.image[0], "alpha": rendering.alpha[0]}

@@ -28,7 +28,7 @@ from ghgs_lit.diagnostics.benchmark.measure import (
     relative_difference,
     time_cases,
     top_level,
-    watched,
+    watch_model,
 )
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.errors import InputError
@@ -109,7 +109,7 @@ def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene, 
     bounds = model.model.bounds
     with torch.no_grad():  # as in the measurement: kernels round otherwise than PyTorch
         close(result[0].gaussians, model(scene).gaussians, 0)
-    with watched(model.model, SecondsProbe(CPU)):
+    with watch_model(model.model, SecondsProbe(CPU)):
         assert model.model.bounds is not bounds
         assert model.model.bounds.samples == bounds.samples
     assert model.model.bounds is bounds
