@@ -66,8 +66,8 @@ def _explain_missing_option(error: MissingConfigException) -> str:
 
 
 def _explain_override(error: Exception, verb: str) -> str:
-    """Message for an unknown key, with the closest group or key of the verb, or for another override that
-    Hydra rejects."""
+    """Message for an unknown key, with the closest group or key of the verb, for a number in place of an
+    option, or for another override that Hydra rejects."""
     message = str(error)
     if unknown := re.match(r"Could not override '([^']+)'", message):
         name, *_ = unknown[1].split(".")
@@ -75,6 +75,10 @@ def _explain_override(error: Exception, verb: str) -> str:
         known.update(path.name for path in conf_dir().iterdir() if path.is_dir())
         hint = "" if name in known else did_you_mean(name, known)
         return f"{unknown[1]}: expected a key or group of this verb; found none of that name{hint}"
+    for group, _, option in (word.partition("=") for word in sys.argv[1:]):
+        known = sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
+        if "Config group override" in message and known and option not in known:
+            return f"{group}: expected one of {', '.join(known)}; found {option}"
     quoted = re.search(r"'([^'=]+)", message)
     named = quoted[1] if quoted else " ".join(word for word in sys.argv[1:] if word != NO_FILES_OF_HYDRA)
     if isinstance(error, OverrideParseException):

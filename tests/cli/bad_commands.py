@@ -83,8 +83,8 @@ MISSPELT = [
     ("train encoder=vggt_nanoo", 1, "encoder: expected one of vggt_1b", "'vggt_nanoo'", "vggt_nano?"),
     ("view runs/x", 1, "runs/x: expected key=value"),
     ("train -sc install=bash", 2, "--shell-completion: ghgs has none"),
-    ("train views=4", 1, "views=4: expected key=value or group=option"),
-    ("train -m views=3,4", 1, "views=3,4: expected key=value or group=option"),
+    ("train views=4", 1, "views: expected one of random, v3, v4, v5; found 4"),
+    ("train -m views=3,4", 1, "views: expected one of random, v3, v4, v5; found 3,4"),
     ("train sweep=table5", 1, "sweep: expected one of table1", "found 'table5'"),
     ("train hydra/launcher=jobib", 1, "hydra/launcher: expected one of", "did you mean joblib?"),
     (
@@ -102,7 +102,7 @@ MISSPELT = [
 MISSING = [
     ("train ~optimizer", 1, "optimizer: expected a value", "~optimizer"),
     ("train ~seed", 1, "seed: expected a value", "~seed"),
-    ("train optimizer=null", 1, "optimizer=null: expected key=value or group=option"),
+    ("train optimizer=null", 1, "optimizer: expected one of from_scratch, release, short; found null"),
     ("train 'seed=${{foo}}'", 1, "seed: expected a value that can be resolved", "'foo'"),
     ("train seed=", 1, "seed: expected an integer", "found ''"),
     ("train data=thuman2 model.pad=multiple", 1, "data.root: expected", "found null"),
