@@ -158,11 +158,10 @@ class Guard:
     def _skip(self, module: L.LightningModule, scale: float) -> None:
         """Find and save the fault, and remove the gradients, so that the optimizer changes nothing."""
         trainer = module.trainer
-        faults = [self._explain(module, scale)]
+        fault = self._explain(module, scale)
+        faults = [fault] * trainer.world_size
         if trainer.world_size > 1:
-            (mine,) = faults
-            faults = [""] * trainer.world_size
-            torch.distributed.all_gather_object(faults, mine)
+            torch.distributed.all_gather_object(faults, fault)
         found = "; ".join(filter(None, faults)) or "values that are finite one by one, or when run again"
         message = f"step {module.global_step}: expected a finite loss and gradient; found {found}"
         if self._in_a_row >= self.limit:
