@@ -31,7 +31,8 @@ def usage() -> str:
 
 
 def print_help(verb: str, groups: Sequence[str], overrides: Sequence[str], folder: str | None) -> None:
-    """Print the keys of some groups, or the summary, groups and keys of a verb.
+    """Print the keys of some groups, or the files of groups without keys; without groups the summary,
+    groups and keys of a verb.
 
     Args:
         verb: Name of a verb.
@@ -46,6 +47,7 @@ def print_help(verb: str, groups: Sequence[str], overrides: Sequence[str], folde
     choices = reversed(cfg.hydra.runtime.choices.items())
     chosen = {group: name for group, name in choices if not group.startswith("hydra/")}
     known = list(dict.fromkeys([*chosen, *(name for name in cfg if name in KINDS), "rounds"]))
+    places = [conf_dir(), *([Path(folder)] if folder is not None else [])]
     for group in groups:
         if group not in known:
             expected = f"a group of ghgs {verb}, one of {', '.join(known)}"
@@ -55,12 +57,14 @@ def print_help(verb: str, groups: Sequence[str], overrides: Sequence[str], folde
         for kind in kinds_of(group):
             print(f"== {group}" + f": {{kind: {kind}, ...}}" * bool(kind) + " ==")
             _print_fields(class_of(group, kind, group), values.get(kind, {}))
+        if not kinds_of(group):  # its options are files that set keys of other groups
+            for path in sorted(path for place in places for path in (place / group).glob("*.yaml")):
+                print(f"== {group}={path.stem} ==\n{path.read_text()}")
     if groups:
         return
     about = verb_class(verb)
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
     print(f"{about.summary()}: {about.example}\n\n== Groups (group=option; * is chosen) ==")
-    places = [conf_dir(), *([Path(folder)] if folder is not None else [])]
     for group, name in chosen.items():
         options = sorted(path.stem for place in places for path in (place / group).glob("*.yaml"))
         print(f"{group}: {' | '.join(f'{option}*' if option == name else option for option in options)}")
