@@ -72,7 +72,8 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     _, out, _ = call(monkeypatch, capsys, "train", "model=paper", "encoder.width=48", "--help", "encoder")
     assert "width (default 48; " in out
     _, out, _ = call(monkeypatch, capsys, "train", "--help", "ablation")
-    assert "== ablation=neither ==" in out and "similarity: none" in out
+    assert "== ablation=neither ==" in out
+    assert "similarity: none" in out
     code, _, err = call(monkeypatch, capsys, "train", "--help", "depth_heat")
     assert code == 1
     assert "found 'depth_heat' (did you mean depth_head?)" in err
