@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from ghgs_capture.camera_report import diagnose
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.data.view import area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
-from tests.helpers.figures import Figure
+from tests.helpers.figures import Figure, camera_as_stored, write_turned
 from tests.helpers.mistakes import ALL, ONE
 
 
@@ -40,26 +39,19 @@ def test_one_camera_that_disagrees_is_named(tmp_path, name):
     assert found.line.startswith("cam2 disagrees with the others")
 
 
-def test_a_camera_that_hangs_upside_down(tmp_path):
-    """Its photograph is rotated by EXIF, its calibration is for the pixels as stored."""
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_a_camera_that_hangs_upside_down_or_on_its_side(tmp_path, orientation):
+    """Its photograph is rotated by EXIF, its calibration is for the pixels as stored and gives no size."""
     figure = Figure()
-    exif = Image.Exif()
-    exif[0x0112] = 3
-    stored = np.ascontiguousarray(np.rot90(figure.images[1], 2))
-    cameras = {**figure.cameras, "cam1": half_turned(figure.cameras["cam1"])}
-    for given, said, right in ((cameras, "auto", "stored"), (None, "stored", "shown")):
-        path = figure.write(tmp_path, cameras=given)
-        Image.fromarray(stored).save(tmp_path / "cam1.png", exif=exif)
+    turned = {**figure.cameras, "cam1": camera_as_stored(figure.cameras["cam1"], orientation)}
+    for cameras, said, right in ((turned, "auto", "stored"), (figure.cameras, "stored", "shown")):
+        matrices = ("intrinsics", "extrinsics")
+        unsized = {name: {key: camera[key] for key in matrices} for name, camera in cameras.items()}
+        path = figure.write(tmp_path, cameras=unsized)
+        write_turned(tmp_path / "cam1.png", figure.images[1], orientation)
         found = diagnose(CaptureFolder(tmp_path, path, calibration={"exif": said}))
         assert found.line.endswith(f" with calibration.exif={right}")
         require_mended(tmp_path, found, exif=right)
-
-
-def half_turned(camera):
-    k = np.array(camera["intrinsics"])
-    k[:2, 2] = np.array([camera["width"], camera["height"]]) - k[:2, 2]
-    turned = np.diag([-1.0, -1, 1, 1]) @ np.array(camera["extrinsics"])
-    return {**camera, "intrinsics": k.tolist(), "extrinsics": turned.tolist()}
 
 
 @pytest.mark.parametrize(
@@ -85,7 +77,8 @@ def test_copies_are_refused(tmp_path, kind):
         figure.images[2], figure.masks[2] = figure.images[0], figure.masks[0]
     found = examine(tmp_path, figure=figure)
     assert not found.consistent
-    print(found.line)
+    wanted = {"pose": "cam0 and cam2 have the same pose", "photograph": "cam2 disagrees with the others"}
+    assert found.line.startswith(wanted[kind])
 
 
 @pytest.mark.parametrize("factor", [1000, 0.11])

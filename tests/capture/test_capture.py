@@ -14,7 +14,7 @@ from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.refinement import Refinement
 from ghgs_lit.rendering import Renderer
-from tests.helpers.figures import PARTS, Figure
+from tests.helpers.figures import PARTS, Figure, camera_as_stored, write_turned
 from tests.helpers.models import make_model
 from tests.helpers.rigs import SIZE, opencv_pixels, rig
 
@@ -95,35 +95,20 @@ def test_exif_turns_do_not_move_the_subject(tmp_path, orientation, calibrated):
     figure = Figure()
     path = figure.write(tmp_path)
     right = Capture.read(tmp_path, path)
-    turns = {3: 2, 6: 3, 8: 1}[orientation]
-    exif = Image.Exif()
-    exif[0x0112] = orientation
     for name, image in zip(figure.names, figure.images, strict=True):
-        stored = np.ascontiguousarray(np.rot90(image, -turns))
-        Image.fromarray(stored).save(tmp_path / f"{name}.png", exif=exif)
+        write_turned(tmp_path / f"{name}.png", image, orientation)
     options = {}
     if calibrated == "stored":
-        cameras = {n: _stored(c, turns) for n, c in figure.cameras.items()}
+        cameras = {n: camera_as_stored(c, orientation) for n, c in figure.cameras.items()}
         figure.names = []
         figure.write(tmp_path, cameras=cameras)
-        options = {"calibration": {"exif": "stored"}} if turns == 2 else {}
+        options = {"calibration": {"exif": "stored"}} if orientation == 3 else {}
     for one, other in zip(
         right.photographs, Capture.read(tmp_path, path, **options).photographs, strict=True
     ):
         np.testing.assert_array_equal(one.image, other.image)
         np.testing.assert_array_equal(one.mask, other.mask)
         np.testing.assert_allclose(pixel_of(one), pixel_of(other), atol=1e-9)
-
-
-def _stored(camera, turns):
-    """Camera of the stored pixels, from that of the upright photograph."""
-    width, height = camera["width"], camera["height"]
-    k, e = np.array(camera["intrinsics"]), np.array(camera["extrinsics"])
-    for _ in range(turns):  # back, clockwise: new x = height - old y, new y = old x
-        k = np.array([[k[1, 1], 0, height - k[1, 2]], [0, k[0, 0], k[0, 2]], [0, 0, 1]])
-        e = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ e
-        width, height = height, width
-    return {"intrinsics": k.tolist(), "extrinsics": e.tolist(), "width": width, "height": height}
 
 
 NOISE = np.random.default_rng(1).integers(-3, 4, (128, 96, 3))

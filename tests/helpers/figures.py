@@ -25,6 +25,9 @@ PARTS = (
     ((-0.13, 0.42, -0.12), (0.08, 0.42, 0.09)),
 )
 
+#: Quarter turns that show a photograph upright, as for ``numpy.rot90``, by EXIF orientation.
+TURNS = {3: 2, 6: 3, 8: 1}
+
 
 @functools.cache
 def _photographed(views, height, width, seed, jitter, focal):
@@ -77,6 +80,24 @@ class Figure:
         path = folder / "cameras.json"
         path.write_text(json.dumps({"cameras": self.cameras if cameras is None else cameras}))
         return path
+
+
+def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
+    """Write an upright photograph as phones do: in the sensor's orientation, which EXIF states."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(np.ascontiguousarray(np.rot90(image, -TURNS[orientation]))).save(path, exif=exif)
+
+
+def camera_as_stored(camera: Mapping[str, Any], orientation: int) -> dict[str, Any]:
+    """Camera of the stored pixels, from that of the upright photograph."""
+    width, height = camera["width"], camera["height"]
+    k, e = np.array(camera["intrinsics"]), np.array(camera["extrinsics"])
+    for _ in range(TURNS[orientation]):  # back, clockwise: new x = height - old y, new y = old x
+        k = np.array([[k[1, 1], 0, height - k[1, 2]], [0, k[0, 0], k[0, 2]], [0, 0, 1]])
+        e = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ e
+        width, height = height, width
+    return {"intrinsics": k.tolist(), "extrinsics": e.tolist(), "width": width, "height": height}
 
 
 def _turned(angles: np.ndarray) -> np.ndarray:
