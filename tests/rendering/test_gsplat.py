@@ -125,6 +125,19 @@ def test_gsplat_is_called_as_documented(monkeypatch, gsplat, antialiased):
     assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
 
 
+def test_a_lower_limit_of_alpha_applies_to_opacities_and_keeps_their_gradient(monkeypatch):
+    monkeypatch.setattr(gsplat_backend, "load", lambda: Documented)
+    gaussians, views = cloud(40, splits=(15, 0, 25)), camera_ring(2, 20, 30, batch=3)
+    drawn = []
+    for opacity, limit in ((0.9, 0.5), (0.5, 0.999)):
+        leaves = with_gradients(dataclasses.replace(gaussians, opacities=torch.full((40,), opacity)))
+        image = gsplat_backend.rasterize(leaves, views, RasterSettings(alpha_max=limit), 0.5).image
+        image.square().sum().backward()
+        drawn.append((image, leaves.opacities.grad))
+    torch.testing.assert_close(*drawn)
+    assert drawn[0][1].any()
+
+
 def test_the_gradient_in_parts_is_that_of_the_reference(monkeypatch):
     """Gradients flow through projection, lists of tiles and rasterization to all attributes."""
     monkeypatch.setattr(gsplat_backend, "load", lambda: InParts)

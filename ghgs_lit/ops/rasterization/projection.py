@@ -77,7 +77,7 @@ def _project_vector(
     visible = (z >= near) & (z <= _FARTHEST) & (opacity >= layout.ALPHA_MIN)
     visible = visible & (determinant > 0.0) & (determinant < np.inf)
     visible = visible & (u > -_FAR) & (u < _FAR) & (v > -_FAR) & (v < _FAR)
-    # The largest p^2 + q^2 (a power of 2) at which alpha is at least alpha_min.
+    # The largest p^2 + q^2 (a power of 2) at which alpha is at least ALPHA_MIN.
     cutoff = simd.maximum(simd.log2(opacity / layout.ALPHA_MIN), 0.0)
     cutoff = simd.minimum(cutoff, _LARGEST)
     left, right, top, bottom = _extents(view, u, v, a, c, cutoff)

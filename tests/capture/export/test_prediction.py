@@ -263,7 +263,7 @@ def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
 
 
 def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
-    """Files of an earlier prediction remain listed after runs that write others."""
+    """Files of an earlier prediction remain listed after runs that write others, unless they are deleted."""
     batch, prediction = subject
 
     def write(*formats):
@@ -276,6 +276,11 @@ def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
     with pytest.raises(InputError, match=r"gaussians\.spz: expected no file, or one that an earlier"):
         write("ply", "spz")
     assert (tmp_path / "gaussians.spz").read_text() == "somebody's"
+    (tmp_path / "gaussians.ply").unlink()
+    write("html")
+    (tmp_path / "gaussians.ply").write_text("somebody's, where ours was")
+    with pytest.raises(InputError, match=r"gaussians\.ply: expected no file, or one that an earlier"):
+        write("ply")
     (tmp_path / "report.json").write_text("{}")
     with pytest.raises(InputError, match=r"found 'another file'"):
         write("ply")
