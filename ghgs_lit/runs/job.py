@@ -53,11 +53,16 @@ def find_curves(directory: Path) -> Path:
     if begun or not in_sweep():
         return begun[0] if begun else folder
     hydra = HydraConfig.get()
-    plan = Path(hydra.sweep.dir, PLAN)
-    shared = lookup(read_yaml(plan), _TASK) if plan.is_file() else ()
+    shared = _overrides_of(Path(hydra.sweep.dir))
     changes = [text for text in hydra.overrides.task if text not in shared]
     changes = [text for text in changes if is_hyperparameter(key_of(text))]
     return folder / ",".join(changes).replace(os.sep, "_")[-200:]
+
+
+def _overrides_of(sweep: Path) -> list[str]:
+    """Command-line overrides of a sweep's last command; empty if its sweeper writes no ``multirun.yaml``."""
+    plan = sweep / PLAN
+    return lookup(read_yaml(plan), _TASK) if plan.is_file() else []
 
 
 def register_resolvers() -> None:
@@ -75,16 +80,21 @@ def register_resolvers() -> None:
     def run_of_job(name: str, *, _root_: DictConfig) -> str:
         if not is_queued_again():
             return name
+        # Kept for the jobs of a sweep, whose overrides differ from those of its command.
+        found = OmegaConf.get_cache(_root_)["run_of_job"]
+        if name in found:
+            return found[name]
         runs = Path("runs", _root_.hydra.job.name)
         if name.startswith("sweep_"):
             command = list(_root_.hydra.overrides.task)
             sweeps = {run.path.parent for run in find_runs_of_job(runs, f"sweep_*/*/{MARKER}")}
-            folders = [sweep for sweep in sweeps if lookup(read_yaml(sweep / PLAN), _TASK) == command]
+            folders = [sweep for sweep in sweeps if _overrides_of(sweep) == command]
         else:
             own_hash = hash_of_run(_root_=_root_)
             begun = find_runs_of_job(runs, f"*/{MARKER}")
             folders = [run.path for run in begun if run.marker.config_hash == own_hash]
-        return max((path.name for path in folders), default=name)
+        found[name] = max((path.name for path in folders), default=name)
+        return found[name]
 
     def folder(first: str | float | None, second: str) -> str:
         return second if first is None else str(Path(str(first)).expanduser())

@@ -1,8 +1,10 @@
 """SLURM jobs: their processes, and their continuation after they are requeued."""
 
+import datetime
+import itertools
 import os
 import signal
-import time
+from unittest.mock import Mock
 
 import pytest
 
@@ -46,7 +48,10 @@ def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
 @pytest.fixture
 def task(monkeypatch, tmp_path):
     """Set the environment of ``srun`` and a new working directory; returns the file to which requests to
-    SLURM are written."""
+    SLURM are written. Directories are named by the time, which is a second later at each look."""
+    start, seconds = datetime.datetime(2026, 1, 1), itertools.count()
+    clock = Mock(now=lambda: start + datetime.timedelta(seconds=next(seconds)))
+    monkeypatch.setattr("hydra.core.utils.datetime", clock)
     for name, value in (BATCH | {"SLURM_NTASKS": "1", "SLURM_STEP_ID": "0"}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("SLURM_RESTART_COUNT", raising=False)
@@ -73,6 +78,7 @@ def stop_with(number):
     [
         ("seed=3",),
         ("-m", "seed=3,4"),
+        ("-m", "seed=3,4", "hydra/sweeper=basic"),
         ("-m", "seed=3,4", "hydra/sweeper=basic", "hydra.sweep.dir=mine"),
         ("seed=3", "hydra.run.dir=mine"),
     ],
@@ -106,7 +112,6 @@ def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
     assert not (task.parent / "runs" / "train" / "1" / "metrics.json").exists()
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     monkeypatch.setenv("SLURM_JOB_ID", "1235")
-    time.sleep(1 - time.time() % 1)  # directories are named by seconds
     assert call(monkeypatch, capsys, "train", "seed=3")[0] == 0
     assert not (task.parent / "runs" / "train" / "1" / "metrics.json").exists()
 
