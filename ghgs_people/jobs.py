@@ -247,10 +247,7 @@ def render_people(
             guard, or people are invalid (raised after all others are rendered).
         RuntimeError: a rendering process died.
     """
-    # A worker that imports a script without a main guard would wait for its parent forever.
-    is_imported = getattr(multiprocessing.current_process(), "_inheriting", False)
-    expected = '`if __name__ == "__main__":` around what a script does, or data.render_workers=0'
-    require(not is_imported, sys.argv[0], expected, None)
+    _require_main_guard()
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
@@ -259,34 +256,53 @@ def render_people(
     check_settings(notes, made_with)
     if not any(notes.missing(phase, listed) for phase, listed in names.items()):
         return 0
-    workspaces = notes.folder / "tmp"
+    render = functools.partial(render_person, source, rig, settings, seed)
     with lock(notes.folder / "lock", wait=True) as held, name_folder_in_errors(notes.root):
         require(held, str(root), "one rendering at a time in a process", "another")
         check_settings(notes, made_with)  # another process may have stored others in the meantime
-        shutil.rmtree(workspaces, ignore_errors=True)  # of killed runs
         _request(notes, names)
         todo = []
         for phase, listed in names.items():
             todo += [(phase, name) for name in notes.missing(phase, listed)]
-        render = functools.partial(render_person, source, rig, settings, seed)
-        folders = [workspaces / f"{phase}-{name}" for phase, name in todo]
-        results = _map(render, folders, [name for _, name in todo], workers)
-        progress = {"total": len(todo), "console": Console(stderr=True)}
-        bad = []
-        try:
-            for index, why in track(results, f"rendering into {root}", **progress):
-                phase, name = todo[index]
-                if why:
-                    bad.append(why)
-                    log.warning("%s is not rendered: %s", name, why)
-                else:
-                    _publish(notes, phase, name, folders[index])
-        finally:
-            results.close()
-            shutil.rmtree(workspaces, ignore_errors=True)
+        bad = _render_subjects(notes, todo, render, workers)
     if bad:
         raise InputError(f"{min(bad)} ({len(bad)} of {len(todo)} people are bad; the others are rendered)")
     return len(todo)
+
+
+def _require_main_guard() -> None:
+    """Reject a script whose workers, which import it, would render as well and wait for their parent
+    forever."""
+    is_imported = getattr(multiprocessing.current_process(), "_inheriting", False)
+    expected = '`if __name__ == "__main__":` around what a script does, or data.render_workers=0'
+    require(not is_imported, sys.argv[0], expected, None)
+
+
+def _render_subjects(
+    notes: Completeness,
+    todo: Sequence[tuple[str, str]],
+    render: Callable[[Path, str], str],
+    workers: int | None,
+) -> list[str]:
+    """Render pairs of phase and name and move them to their place; returns why subjects are invalid."""
+    workspaces = notes.folder / "tmp"
+    shutil.rmtree(workspaces, ignore_errors=True)  # of killed runs
+    folders = [workspaces / f"{phase}-{name}" for phase, name in todo]
+    results = _map(render, folders, [name for _, name in todo], workers)
+    progress = {"total": len(todo), "console": Console(stderr=True)}
+    bad = []
+    try:
+        for index, why in track(results, f"rendering into {notes.root}", **progress):
+            phase, name = todo[index]
+            if why:
+                bad.append(why)
+                log.warning("%s is not rendered: %s", name, why)
+            else:
+                _publish(notes, phase, name, folders[index])
+    finally:
+        results.close()
+        shutil.rmtree(workspaces, ignore_errors=True)
+    return bad
 
 
 def check_settings(notes: Completeness, settings: dict) -> None:
