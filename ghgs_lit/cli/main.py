@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.runs.processes import Interrupted, interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again, keep_freed_memory
 from ghgs_lit.runtime.cores import spin_if_alone
@@ -55,6 +56,9 @@ def main() -> int:
     try:
         with interruptible():
             return _command(argv)
+    except InputError as error:  # in a plug-in, before a verb is chosen
+        print(f"ghgs: {error}", file=sys.stderr)
+        return 1
     except Interrupted as stop:
         if not stop.explained:
             name = signal.Signals(stop.number).name

@@ -38,7 +38,7 @@ def load_plugins() -> None:
     Errors raised inside a module keep their type.
 
     Raises:
-        InputError: A file is missing, or another module has its name.
+        InputError: A file is missing, has a dot in its name, or another module has its name.
     """
     # Files opened while the collector is disabled would be frozen, and not flushed at exit.
     gc.enable()
@@ -58,7 +58,8 @@ def _installed_plugins() -> tuple[str, ...]:
 
 def _import_file(path: Path) -> None:
     """Import a Python file by its name, after adding its folder to the import path."""
-    require(path.is_file(), VARIABLE, "a Python file", str(path))
+    fits = path.is_file() and "." not in path.stem
+    require(fits, VARIABLE, "a Python file without a dot in its name", str(path))
     if str(path.parent) not in sys.path:
         # Appended, so that the file's neighbours do not shadow installed packages.
         sys.path.append(str(path.parent))

@@ -62,6 +62,16 @@ def test_wrong_keys_are_refused_in_one_line(tmp_path, capsys, arguments, message
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("name", ["own.verb.py", "none.py"])
+def test_a_file_that_cannot_be_imported_is_one_line(tmp_path, monkeypatch, capsys, name):
+    """Regression: it was a traceback before a verb was chosen."""
+    (tmp_path / "own.verb.py").write_text(FILE)
+    monkeypatch.setenv(registry.VARIABLE, name)
+    assert ghgs("--help") == 1
+    expected = f"expected a Python file without a dot in its name; found '{tmp_path / name}'"
+    assert capsys.readouterr().err == f"ghgs: {registry.VARIABLE}: {expected}\n"
+
+
 def test_a_sweep_of_it_runs_every_combination(capsys):
     assert ghgs("greet", "-m", "name=Ada,Bob", "times=1", "hydra.sweep.dir=sweep") == 0
     out = capsys.readouterr().out
