@@ -21,7 +21,8 @@ from ghgs_lit.errors import InputError, require
 #: Errors that indicate bad input rather than a bug.
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
-#: Hydra would write .hydra through links; a run's config.yaml replaces it.
+#: Hydra would write .hydra through links; a run's config.yaml replaces it. An override, because Hydra's
+#: default takes precedence over ``conf/hydra/output``.
 NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
 
 #: Nodes of Lightning's classes; their keys have defaults, so they may be deleted.
@@ -75,9 +76,10 @@ def _explain_override(error: Exception, verb: str) -> str:
         known.update(path.name for path in conf_dir().iterdir() if path.is_dir())
         hint = "" if name in known else did_you_mean(name, known)
         return f"{unknown[1]}: expected a key or group of this verb; found none of that name{hint}"
+    # Hydra's error contains neither the group nor the number.
     for group, _, option in (word.partition("=") for word in sys.argv[1:]):
         known = sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
-        if "Config group override" in message and known and option not in known:
+        if known and re.match(r"\d|null$", option):
             return f"{group}: expected one of {', '.join(known)}; found {option}"
     quoted = re.search(r"'([^'=]+)", message)
     named = quoted[1] if quoted else " ".join(word for word in sys.argv[1:] if word != NO_FILES_OF_HYDRA)

@@ -52,12 +52,7 @@ MISSPELT = [
     ("train experiment=demo ~evaluation.views", 1, "evaluation.views: expected a value", "~evaluation.views"),
     ("train optimizer.lrr=1", 1, "optimizer.lrr: expected one of ", "did you mean lr?"),
     ("train rouns=null", 1, "rouns: expected a key", "(did you mean rounds?)"),
-    (
-        "train model=recurrent rouns.height=null",
-        1,
-        "rouns.height: expected",
-        "(did you mean rounds?)\n",
-    ),
+    ("train model=recurrent rouns.height=null", 1, "rouns.height: expected", "(did you mean rounds?)\n"),
     ("train data=humman data.rot=x", 1, "data.rot: expected", "(did you mean root?)"),
     ("train optimizer.learning_rate=1", 1, "optimizer.learning_rate: expected one of "),
     ("train lr=1e-3", 1, "lr: expected a key or group of this verb; found none of that name"),
@@ -85,6 +80,7 @@ MISSPELT = [
     ("train -sc install=bash", 2, "--shell-completion: ghgs has none"),
     ("train views=4", 1, "views: expected one of random, v3, v4, v5; found 4"),
     ("train -m views=3,4", 1, "views: expected one of random, v3, v4, v5; found 3,4"),
+    ("train -m skip=exact,balanced views=4", 1, "views: expected one of random, v3, v4, v5; found 4"),
     ("train sweep=table5", 1, "sweep: expected one of table1", "found 'table5'"),
     ("train hydra/launcher=jobib", 1, "hydra/launcher: expected one of", "did you mean joblib?"),
     (
@@ -107,11 +103,7 @@ MISSING = [
     ("train seed=", 1, "seed: expected an integer", "found ''"),
     ("train data=thuman2 model.pad=multiple", 1, "data.root: expected", "found null"),
     ("train data=scans data.root={tmp}/none", 1, "{tmp}/none: expected the folder of the data set"),
-    (
-        "train data=scans 'data.root={tmp}/${{data.name}}'",
-        1,
-        "{tmp}/scans: expected the folder",
-    ),
+    ("train data=scans 'data.root={tmp}/${{data.name}}'", 1, "{tmp}/scans: expected the folder"),
     (
         "train data=humman model.pad=multiple data.root={empty} targets=cameras evaluation.targets=[cameras]",
         1,
@@ -120,12 +112,7 @@ MISSING = [
     ("doctor", 1, "images: expected images=<folder", "or task=machine; found None"),
     ("evaluate", 1, "data: expected data=<option>"),
     ("evaluate data=synthetic", 1, "checkpoint: expected a checkpoint or baselines=[...]; found neither"),
-    (
-        "evaluate data=synthetic checkpoint=shipped skip=temporal",
-        1,
-        "skip: expected one of",
-        "temporal",
-    ),
+    ("evaluate data=synthetic checkpoint=shipped skip=temporal", 1, "skip: expected one of", "temporal"),
     ("evaluate checkpoint={tmp}/none.ckpt", 1, "{tmp}/none.ckpt: expected"),
     ("evaluate checkpoint={ckpt}", 1, "data: expected data=<option>", "{ckpt}"),
     ("evaluate checkpoint={ckpt} data=thuman2 model.pad=multiple", 1, "data.root: expected", "found null"),
