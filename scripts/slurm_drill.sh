@@ -91,7 +91,6 @@ done
 step "sweep by hydra/launcher=slurm"
 "${train[@]}" -m seed=1,2 "${slurm[@]}" "hydra.sweep.dir=$out/sweep" > "$out/log/sweep" 2>&1
 tail -n 2 "$out/log/sweep"
-grep -ci sacct "$out/log/sweep" | sed "s/^/lines about sacct: /" || true
 
 step "the same with 3 minutes for a job, and a signal 60 s before"
 "${train[@]}" -m seed=1,2 "${slurm[@]}" hydra.launcher.timeout_min=3 hydra.launcher.signal_delay_s=60 \

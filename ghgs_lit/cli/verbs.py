@@ -144,7 +144,6 @@ class Prepare(Verb):
 
     task: Literal["render", "check"] = "render"
     """render: render missing subjects. check: read every image and camera once."""
-    """Limits of good data for task=check."""
     seed: Seed = 0
     """Seed of the samples that task=check reads."""
 
