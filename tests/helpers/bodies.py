@@ -8,13 +8,13 @@ from ghgs_people.figures.body import BODY_VERTICES, load_body
 from tests.helpers.cameras import camera_ring
 
 
-def body_batch(batch=1, views=4, height=112, width=84, turn=20.0):
+def body_batch(batch=1, views=4, height=112, width=84):
     """The batch, and the vertex visible in each pixel [B, V, H, W], -1 for none."""
     body = load_body()
     vertices = torch.from_numpy(body.rest(body.bodies[0])[0][:BODY_VERTICES]).float()
-    place = {"center": (0.0, 0.85, 0.0), "raised": 0.2, "radius": 2.5}
+    place = {"center": (0.0, 0.85, 0.0), "raised": 0.2, "radius": 2.5, "turn": 20.0}
     focal, principal = (1.1 * height, 1.1 * height), (width / 2, height / 2)
-    cameras = camera_ring(views, height, width, batch, focal, principal, **place, turn=turn)
+    cameras = camera_ring(views, height, width, batch, focal, principal, **place)
     shown = torch.full((batch, views, height, width), -1)
     depths = torch.zeros(batch, views, height, width)
     for b in range(batch):

@@ -99,10 +99,10 @@ def inside(view: View, points: np.ndarray) -> float:
     return float(near[rows[framed], columns[framed]].sum() / len(points))
 
 
-def blob(height: int, width: int, x: float, y: float, sigma: float = 3.0) -> np.ndarray:
+def blob(height: int, width: int, x: float, y: float) -> np.ndarray:
     """[h, w, 3] uint8: a spot at ``x``, ``y``, with pixel centres at integers, as in OpenCV."""
     rows, columns = np.mgrid[:height, :width]
-    spot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    spot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 3.0**2))
     return np.repeat(np.round(255 * spot)[..., None], 3, -1).astype(np.uint8)
 
 

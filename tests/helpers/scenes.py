@@ -101,9 +101,9 @@ def surface_splats(batch):
     return Gaussians(means, turns, sizes, opacities, colors, counts, image, pixel)
 
 
-def training_batch(batch=1, size=28, views=3):
+def training_batch(batch=1, size=28):
     """:func:`make_batch` with a target for each element, points of the surface, and names."""
-    inputs, seen = make_batch(batch, views, size, size), make_batch(batch, 2, size, size, spread=90.0)
+    inputs, seen = make_batch(batch, 3, size, size), make_batch(batch, 2, size, size, spread=90.0)
     g = torch.Generator().manual_seed(4)
     directions = torch.nn.functional.normalize(torch.randn(batch, 40, 3, generator=g), dim=-1)
     return replace(

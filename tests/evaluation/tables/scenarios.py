@@ -188,6 +188,11 @@ RUNS: dict[str, list[tuple]] = {
         *noisy("neither", 21.0, 21.1, 21.3),
         *noisy("no_semantic", 20.1, 20.1, 20.2),
     ],
+    "models_with_seeds": [
+        *noisy("full", 20.0, 20.1),
+        *noisy("full", 20.2, 20.4, model=HULL),
+        *noisy("full", 20.1, 20.3, model={"name": "gps"}),
+    ],
     "low": [
         *noisy("full", 20.0, 20.1, metrics={"lpips": 0.2}),
         *noisy("neither", 20.0, 20.3, metrics={"lpips": 0.1}),

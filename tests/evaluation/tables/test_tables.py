@@ -136,6 +136,16 @@ def test_other_views_and_targets_are_other_rows(tmp_path, key, values, seeds, is
     assert list(table.cells["mean"][:, 0, "psnr"]) == [23.0, 24.0]
 
 
+@pytest.mark.parametrize(
+    ("runs", "layout", "comparisons"), [("clear", "table4", 2), ("models_with_seeds", "table3", 3)]
+)
+def test_a_reference_that_its_figures_chose_counts_all_pairs(runs, layout, comparisons, tmp_path):
+    (table,) = built(runs, {"layout": layout, "reported": False}, tmp_path)
+    assert table.comparisons == comparisons
+    clearest = min(table.cells["test"].dropna(), key=lambda test: test.p)
+    assert clearest.corrected == pytest.approx(comparisons * clearest.p)
+
+
 def test_a_subject_counts_once_however_many_targets_it_has(tmp_path):
     path = write_run(tmp_path, "full", 20.0, views=(4,))
     content = json.loads(path.read_text())
