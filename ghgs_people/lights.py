@@ -37,10 +37,8 @@ class Lights:
 
     count: tuple[int, int] = (2, 4)
     ambient: tuple[float, float] = (0.25, 0.55)  # fraction of ambient light, 0 to 1
-    sky: tuple[float, float] = (
-        0.1,
-        0.7,
-    )  # relative increase of ambient light from above compared with the side, 0 to 1
+    # relative increase of ambient light from above compared with the side, 0 to 1
+    sky: tuple[float, float] = (0.1, 0.7)
     radius: tuple[float, float] = (4.0, 25.0)  # angular radius of a light, degrees
     elevation: tuple[float, float] = (5.0, 60.0)  # of a light, degrees
     contrast: float = 0.6  # relative variation of the lights' strengths, 0 to below 1

@@ -8,7 +8,7 @@ from hydra.core.config_store import ConfigStore
 
 
 def rehearse(planned: list[Any]) -> Any:
-    """What a dry run tries, of a room above that of sweeps."""
+    """Check the prerequisites of runs; an argument, because sweeps do not import verbs."""
     from ghgs_lit.cli import rehearsal  # here: other commands need no PyTorch yet
 
     return rehearsal.rehearse(planned)
