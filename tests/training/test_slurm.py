@@ -103,6 +103,19 @@ def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, n
     assert len(list(task.parent.rglob("metrics.json"))) == (2 if "-m" in places else 1)
 
 
+def test_a_sweep_without_its_command_begins_anew(monkeypatch, capsys, task):
+    """Other sweepers may write no multirun.yaml, which was an error."""
+    command = ("train", "-m", "seed=3,4", "hydra/sweeper=basic")
+    monkeypatch.setattr(train_verb, "train", stop_with(signal.SIGTERM))
+    assert call(monkeypatch, capsys, *command)[0] == 143
+    next(task.parent.rglob("multirun.yaml")).unlink()
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    code, _, err = call(monkeypatch, capsys, *command)
+    assert code == 0, err
+    assert len({path.parents[1] for path in task.parent.rglob("metrics.json")}) == 1
+
+
 def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
     """A second command in an interactive job is a new run."""
     monkeypatch.setattr(train_verb, "train", stop_with(signal.SIGTERM))
