@@ -123,6 +123,10 @@ RUNS: dict[str, list[tuple]] = {
         ("full", 21.0, {"measured": {"checkpoint": "b.ckpt"}}),
         ("full", 22.0, {"seed": 2, "measured": {"checkpoint": "c.ckpt"}}),
     ],
+    "refined": [
+        ("full", 20.0, {"measured": {"refine": 0, "refine_cameras": 0}}),
+        ("full", 21.0, {"measured": {"refine": 15, "refine_cameras": 4}}),
+    ],
     "views": [
         ("full", 20.0, {"views": (3, 4), "of_views": views(3)}),
         ("full", 21.0, {"views": (3, 4), "of_views": views(4), "seed": 2}),
@@ -263,6 +267,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("same_numbers", {}, CONFIGURATION + r"recalibration.k` \(64, 1\): by=\[recalibration.k\]"),
     ("rivals", {}, "their configurations are equal; runs="),
     ("checkpoints", {}, r"0/metrics.json and .*1/metrics.json.*by=\[checkpoint\]"),
+    ("refined", {}, r"by=\[refine,refine_cameras\]"),
     ("checkpoints", {"by": ["chekpoint"]}, "by: expected keys of the runs' configurations; .*'chekpoint'"),
     ("settings", {"targets": ("random",)}, r"evaluation\.targets: expected some of release, midway.*random"),
     ("mixed", {"views": (7,)}, r"evaluation\.views: expected some of 3, 4, 5, .*7"),
