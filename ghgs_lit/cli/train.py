@@ -101,13 +101,13 @@ def build_trainer(run: Run, directory: Path, *further: Callback) -> L.Trainer:
     Args:
         run: Run with the groups ``trainer``, ``logger`` and ``callbacks``.
         directory: Directory of the run, below which loggers and callbacks write.
-        *further: Callbacks that precede the configured ones.
+        *further: Callbacks that follow the configured ones, whose state a checkpoint at a signal contains.
 
     Raises:
         InputError: The Trainer rejects its options.
     """
     logs = [options.build(save_dir=str(directory)) for options in run.logger.values()]
-    callbacks = [*further, *(options.build() for options in run.callbacks.values())]
+    callbacks = [*(options.build() for options in run.callbacks.values()), *further]
     return run.trainer.build(
         logger=logs or False,
         plugins=[AtomicCheckpointIO(), *environments()],

@@ -10,6 +10,8 @@ import lightning.pytorch as L
 import pytest
 import torch
 
+from ghgs_lit.cli.train import build_trainer
+from ghgs_lit.config import run_of
 from ghgs_lit.runs import processes
 from ghgs_lit.runs.processes import Interrupted, handlers, interruptible
 from ghgs_lit.training.checkpoints import AfterSteps, AtomicCheckpointIO, CheckpointOptions, StopAtStep
@@ -144,6 +146,12 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
         assert torch.equal(a, b)
     assert first.validations + second.validations == validations
     assert rows(tmp_path / "cut") == rows(folder)
+
+
+def test_a_checkpoint_at_a_signal_follows_the_best_one(tmp_path):
+    """Regression: a signal before a validation saved the best score of the one before."""
+    trainer = build_trainer(run_of("train"), tmp_path, StopAtStep())
+    assert isinstance(trainer.callbacks[-1], StopAtStep)
 
 
 def test_nothing_is_saved_between_the_parts_of_a_step(tmp_path):
