@@ -15,17 +15,7 @@ def rehearse(planned: list[Any]) -> Any:
 
 
 class GridSweeper(basic_sweeper.BasicSweeper):
-    """Runs every combination of values once, and skips runs that are done.
-
-    Attributes:
-        verb: name of the verb whose runs these are.
-    """
-
-    verb = "train"
-
-    def setup(self, *, hydra_context: Any, task_function: Any, config: Any) -> None:
-        super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
-        self.verb = getattr(task_function, "keywords", {}).get("name", self.verb)
+    """Runs every combination of values once, and skips runs that are done."""
 
     def sweep(self, arguments: list[str]) -> Any:
         from ghgs_lit.runs.sweep import sweep  # Hydra imports its plugins for every application

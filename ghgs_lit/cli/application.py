@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -21,10 +20,9 @@ from ghgs_lit.cli.help import print_help
 from ghgs_lit.config import VERSION_BASE, compose, conf_dir
 from ghgs_lit.config.compose import check_ablation, store_defaults, to_plain
 from ghgs_lit.config.defaults import fill
-from ghgs_lit.config.options import UnknownKey
 from ghgs_lit.config.reading import read_as_ghgs
 from ghgs_lit.config.registry import read_nodes, verb_class
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import require
 from ghgs_lit.files import require_no_links
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.processes import interruptible
@@ -36,43 +34,25 @@ register_resolvers()  # on import, so that the processes of a launcher have them
 read_as_ghgs()
 
 
-def remove_unused(directory: Path, since: float) -> None:
-    """Remove the directory that Hydra created for a command if it has no file but the configuration of
-    this command.
-
-    Args:
-        directory: Directory of the run.
-        since: Time of startup in seconds since the epoch; older files and directories are kept.
-    """
-    if not directory.is_dir() or directory.samefile(".") or directory.stat().st_mtime < since:
-        return
-    written = directory / "config.yaml"
-    if all(path == written and path.lstat().st_mtime >= since for path in directory.iterdir()):
-        written.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # another process has begun a run in it
-            directory.rmdir()
-
-
 #: Names that a run appends to or that libraries write in place, in addition to the log.
 _WRITTEN_IN_PLACE = (*WRITTEN, SESSIONS)
 
 
 @interruptible()
-def work(cfg: DictConfig, name: str, argv: Sequence[str], started: float) -> object:
+def work(cfg: DictConfig, name: str, argv: Sequence[str]) -> object:
     """Check the configuration and do the work of a verb, in this process or in that of a launcher.
 
     Args:
         cfg: Configuration composed by Hydra.
         name: Name of the verb.
         argv: Command-line arguments, program and verb first.
-        started: Time of startup in seconds since the epoch; older files are kept.
 
     Returns:
         Return value of the verb.
 
     Raises:
-        SystemExit: Bad input, outside a sweep; the message is printed, and a directory with nothing but
-            files of the startup is removed.
+        SystemExit: Bad input, outside a sweep; the message is printed, and an empty directory is
+            removed.
     """
     # Lightning starts the other processes of a DDP job with sys.argv, which must contain the verb.
     sys.argv = list(argv)
@@ -96,19 +76,19 @@ def work(cfg: DictConfig, name: str, argv: Sequence[str], started: float) -> obj
             require_no_links(directory.path, (*_WRITTEN_IN_PLACE, f"{hydra_node.job.name}.log"))
         collect_garbage_again()
         let_children_sleep()
-        result = verb.run()
-        if is_dry:
-            remove_unused(directory.path, started)
-        return result
+        return verb.run()
     except messages.BAD_INPUT as error:
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:
             error.filename = str(directory.path)  # of a full disk, for example
         if is_single:
-            remove_unused(directory.path, started)
             # Hydra would print a line about errors that leave its job.
             print(f"ghgs {name}: {messages.format_error(error, name)}", file=sys.stderr)
             raise SystemExit(1) from error
         raise
+    finally:
+        with contextlib.suppress(OSError):  # not empty
+            if directory.path != Path.cwd():
+                directory.path.rmdir()
 
 
 def _rewrite_overrides(verb: str, arguments: list[str]) -> list[str]:
@@ -136,12 +116,7 @@ def _print_configuration(name: str, overrides: list[str], values: Namespace) -> 
     cfg = compose(name, overrides, with_hydra=True, folder=values.config_dir)
     HydraConfig.instance().set_config(cfg)
     cfg = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-    try:
-        read_nodes(OmegaConf.to_container(cfg, resolve=True))
-    except UnknownKey:
-        raise
-    except InputError:  # users may print the configuration to find a wrong value
-        pass
+    read_nodes(OmegaConf.to_container(cfg, resolve=True))
     print(OmegaConf.to_yaml(cfg, resolve=values.resolve), end="")
 
 
@@ -161,7 +136,7 @@ def _run(verb: str, argv: list[str]) -> None:
     if values.multirun or "hydra.mode=MULTIRUN" in overrides:
         messages.check_directory(overrides, sweeps=True)
     sys.argv = [argv[0], *flags, *overrides, messages.NO_FILES_OF_HYDRA]
-    task = partial(work, name=verb, argv=argv, started=time.time())
+    task = partial(work, name=verb, argv=argv)
     hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
 
 

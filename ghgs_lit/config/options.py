@@ -141,10 +141,6 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-class UnknownKey(InputError):
-    """Options have no field of this name."""
-
-
 class _Checked(type(BaseModel)):
     """Metaclass that raises :class:`InputError` also for options created in Python."""
 
@@ -283,7 +279,7 @@ def _input_error(cls: type[Options], key: str, values: Any, error: ValidationErr
         known = ", ".join(sorted(cls.model_fields))
         expected = f"one of {known}" if known else "no keys"
         hint = did_you_mean(name, cls.model_fields)
-        return UnknownKey(f"{'.'.join([*path, name])}: expected {expected}; found {name!r}{hint}")
+        return InputError(f"{'.'.join([*path, name])}: expected {expected}; found {name!r}{hint}")
     if first["type"] == "missing" and first["loc"][-1] == path[-1]:
         return InputError(f"{dotted}: expected a value; found none")
     return InputError(f"{dotted}: expected {cause or wanted}; found {format_value(_to_plain(values))}")

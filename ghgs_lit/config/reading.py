@@ -96,30 +96,25 @@ def check_file(file: Path, name: str, package: str, config: Any) -> None:
     """
     content = OmegaConf.to_container(config)
     require(isinstance(content, dict), str(file), "keys with values", content)
+    # Packages accumulate along the lists of defaults.
+    packages = [package, *re.findall(r"@[^'\"]*", str(content.get("defaults")))]
+    if name.startswith("hydra/"):
+        packages.append(name)
+    for each in packages:
+        require("hydra" not in each, f"{file}: @package", "a package outside of hydra", each)
     for key, value in flatten(content).items():
         # Hydra drops backslashes from grid values.
         others = _REFERENCE.sub("", f"{key}={value}".replace("\\", ""))
         require("${" not in others, f"{file}: {key}", "no interpolations but references to keys", value)
-    *groups, _ = name.split("/")
-    is_of_hydra = groups[:1] == ["hydra"]
-    # Packages accumulate along the lists of defaults.
-    require("hydra" not in package, f"{file}: @package", "a package outside of hydra", package)
-    for entry in content.pop("defaults", None) or ():
-        for group in entry if isinstance(entry, dict) else [str(entry)]:
-            moves = "hydra" in group.partition("@")[2] or (is_of_hydra and re.search("@|^/", group))
-            require(not moves, f"{file}: defaults", "nothing that is moved into hydra", group)
-    prefix = ".".join(groups) if is_of_hydra and package != "_global_" else ""
-    for key, value in flatten(content, prefix).items():
-        if is_below(key, ["hydra"]) and not _may_set(key.removeprefix("hydra."), value):
+        if is_below(key, ["hydra"]) and not _may_set(key, value):
             expected = f"no keys but {', '.join(SETTABLE)}, with values that are no objects"
             raise InputError(f"{file}: hydra: expected {expected}; found {key}={value!r}")
 
 
 def _may_set(key: str, value: Any) -> bool:
-    """Whether an external file may set a dotted key below ``hydra`` to an unresolved value: Hydra
-    instantiates mappings with keys such as ``_target_``, also where a value refers to one."""
-    if not is_below(key, SETTABLE) or re.search(r"\._|hydra", key):  # keys of a grid are overrides
-        return False
-    values = value if isinstance(value, list) else [value]
-    refers = key.startswith("sweeper") and any(re.match(r"\s*\$", str(item)) for item in values)
-    return not refers and not any(isinstance(item, dict | list) for item in values)
+    """Whether an external file may set a dotted key to an unresolved value: Hydra instantiates mappings with
+    keys such as ``_target_``, also where a value refers to one, and keys of a grid are overrides."""
+    name = key.removeprefix("hydra.")
+    refers = name.startswith("sweeper") and str(value).lstrip().startswith("$")
+    is_override = re.search(r"\._|hydra", name) is not None
+    return is_below(name, SETTABLE) and not (refers or is_override or isinstance(value, dict | list))

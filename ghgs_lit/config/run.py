@@ -1,63 +1,25 @@
 """A whole configuration as one validated object."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from pydantic import PrivateAttr
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, read_nodes
 
-if TYPE_CHECKING:  # they import large libraries
-    from ghgs_lit.config.nodes import Calibration, EvaluationOptions
-    from ghgs_lit.data.augmentation import Augmentation
-    from ghgs_lit.data.dataset import DataOptions
-    from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
-    from ghgs_lit.execution.options import ModelOptions
-    from ghgs_lit.losses import Losses
-    from ghgs_lit.method.encoder import VGGTOptions
-    from ghgs_lit.method.plan import SkipOptions
-    from ghgs_lit.metrics import MetricsOptions
-    from ghgs_lit.rendering import Renderer
-    from ghgs_lit.training import Optimization
-    from ghgs_lit.training.features import DiskFeatureCache
-    from ghgs_lit.training.trainer import TrainerOptions
-
 #: Entry of a configuration that is neither a key of a verb nor a group: names by which tables identify a run.
 CHOSEN = "chosen"
-
-
-def _is_of_verb(key: str) -> bool:
-    return key not in KINDS and key != CHOSEN
 
 
 class Run(Options):
     """Configuration of a run: keys of the verb are fields, options of each config group are attributes;
     None if the verb has no such group.
 
-    The types are those of the shipped kinds that verbs read; user-defined kinds must have the same
-    attributes. A node without a kind where its group has kinds, such as changes to a checkpoint's data,
+    User-defined kinds must have the attributes of the shipped kinds (:data:`ghgs_lit.config.registry.KINDS`)
+    that verbs read. A node without a kind where its group has kinds, such as changes to a checkpoint's data,
     appears only in :attr:`plain`.
     """
-
-    if TYPE_CHECKING:
-        augmentation: Augmentation
-        calibration: Calibration
-        callbacks: Mapping[str, Options]
-        data: DataOptions
-        encoder: VGGTOptions
-        evaluation: EvaluationOptions
-        feature_cache: DiskFeatureCache
-        logger: Mapping[str, Options]
-        loss: Losses
-        metrics: MetricsOptions
-        model: ModelOptions
-        optimizer: Optimization
-        renderer: Renderer
-        skip: SkipOptions
-        targets: TargetProtocol
-        trainer: TrainerOptions
-        views: ViewProtocol
 
     _plain: dict[str, Any] = PrivateAttr(default_factory=dict)
     _nodes: dict[str, Any] = PrivateAttr(default_factory=dict)
@@ -72,7 +34,8 @@ class Run(Options):
         Raises:
             InputError: A key is unknown, or a value has a wrong type or range.
         """
-        run = cls.read({key: config[key] for key in config if _is_of_verb(key)}, "")
+        of_verb = {key: value for key, value in config.items() if key not in KINDS and key != CHOSEN}
+        run = cls.read(of_verb, "")
         run._plain = dict(config)
         return run
 
@@ -135,6 +98,4 @@ class Run(Options):
         Raises:
             InputError: See :meth:`of`.
         """
-        config = {**self._plain, **changes}
-        run = self.begin(config) if any(map(_is_of_verb, changes)) else self.model_copy()
-        return run.complete(config)
+        return self.of({**self._plain, **changes})

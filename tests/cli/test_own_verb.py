@@ -78,49 +78,6 @@ def test_a_sweep_of_it_runs_every_combination(capsys):
     assert [line for line in out.splitlines() if line.startswith("hello")] == ["hello Ada", "hello Bob"]
 
 
-@pytest.mark.parametrize("verb", ["greet", "stress"])
-def test_runs_of_a_verb_that_does_not_train_are_no_grid(capsys, verb):
-    """Regression: they were read as runs of ``ghgs train``, which has other keys."""
-    name = ["name=Ada,Bob"] if verb == "greet" else ["quick=true,false"]
-    assert ghgs(verb, "-m", *name, "hydra/sweeper=grid", "hydra.sweep.dir=sweep") == 1
-    expected = f"expected basic for ghgs {verb}, which is not derived from ghgs train; found 'grid'"
-    assert capsys.readouterr().err == f"ghgs {verb}: hydra/sweeper: {expected}\n"
-
-
-TRAINING = '''
-from pathlib import Path
-
-from ghgs_lit.cli.verbs import Train
-from ghgs_lit.config.options import Count
-from ghgs_lit.config.registry import register
-
-
-@register("verb", "distil")
-class Distil(Train):
-    """Train towards a teacher."""
-
-    teachers: Count = 1
-    """How many."""
-
-    def run(self):
-        with open("distilled", "a") as file:
-            file.write(f"{self.seed} {self.teachers}\\n")
-'''
-
-
-def test_runs_of_a_verb_derived_from_training_are_planned_with_its_own_keys(tmp_path, capsys):
-    """Regression: they were read as runs of ``ghgs train``, which lacks these keys."""
-    (tmp_path / "own_verb.py").write_text(TRAINING)
-    (tmp_path / "conf").mkdir()
-    own = "defaults: [train, _self_]\nhydra: {job: {name: distil}}\n"
-    (tmp_path / "conf" / "distil.yaml").write_text(own)
-    command = ["--config-dir", "conf", "-m", "teachers=1,2", "seed=7", "hydra.sweep.dir=sweep"]
-    assert ghgs("distil", *command) == 0
-    assert (tmp_path / "distilled").read_text() == "7 1\n7 2\n"
-    configs = sorted(path.read_text() for path in (tmp_path / "sweep").glob("*/config.yaml"))
-    assert [f"teachers: {n}" in text for n, text in zip((1, 2), configs, strict=True)] == [True, True]
-
-
 def test_help_lists_it(capsys):
     assert ghgs("--help") == 0
     assert "Greet somebody, several times" in capsys.readouterr().out

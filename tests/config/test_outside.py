@@ -57,7 +57,7 @@ REFUSED = {
             "hydra/job_logging/y": "defaults: [{/handlers: z}]",
             "handlers/z": "a: {(): CALL}",
         },
-        "defaults: expected nothing that is moved into hydra; found '/handlers'",
+        "@package: expected a package outside of hydra; found 'hydra/job_logging/y'",
     ),
     "an override of the grid": (
         {"experiment/x": GLOBAL + "hydra: {sweeper: {params: {+hydra.job.env_set.A: b}}}"},
@@ -85,11 +85,11 @@ REFUSED = {
             "experiment/x": GLOBAL + "defaults: [{override /hydra/callbacks: y}]",
             "hydra/callbacks/y": "a: {_target_: CALL}",
         },
-        "hydra.callbacks.a._target_=",
+        "@package: expected a package outside of hydra; found 'hydra/callbacks/y'",
     ),
     "a moved group": (
         {"experiment/x": GLOBAL + "defaults: [{/views@hydra.job.env_set: y}]", "views/y": "A: b"},
-        "defaults: expected nothing that is moved into hydra; found '/views@hydra.job.env_set'",
+        "@package: expected a package outside of hydra; found '@hydra.job.env_set'",
     ),
     "a file that is moved": (
         {
