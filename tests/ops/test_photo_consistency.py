@@ -8,10 +8,8 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import VisualHull
-from ghgs_lit.method.heads.depth import DepthHeadOptions
 from ghgs_lit.ops import photo_consistency as stage
 from ghgs_lit.ops.photo_consistency import TOLERANCE, photo_consistency
 from ghgs_lit.types import DepthBounds
@@ -122,15 +120,6 @@ def test_the_order_of_views_does_not_matter():
     first = photo_consistency(batch, DepthBounds(batch.depths, batch.depths + 0.2), 3)
     second = photo_consistency(turned, DepthBounds(turned.depths, turned.depths + 0.2), 3)
     torch.testing.assert_close(first[:, order], second)
-
-
-def test_heads_ask_for_what_photo_consistency_needs():
-    """Photo-consistency without a guide would be computed but never used."""
-    for options in ({"guide": False, "consistency_depths": 4}, {"guide": True, "consistency_depths": -1}):
-        with pytest.raises(InputError, match=r"depth_head\.consistency_depths"):
-            DepthHeadOptions(**options)
-    with pytest.raises(InputError, match=r"gaussian_head\.photo_consistency"):
-        make_head(photo_consistency=True)
 
 
 def test_splats_see_photo_consistency_and_colors_leave_their_pixels_within_the_limit():

@@ -27,6 +27,8 @@ def spoil(batch, wrong):
     elif wrong == "one pixel":
         masks[0, -1] = False
         masks[0, -1, 3, 5] = True
+    elif wrong == "empty":
+        masks[0, -1] = False
     elif wrong == "shifted":
         masks[0, -1] = masks[0, -1].roll(size // 3, -1)
     return dataclasses.replace(batch, masks=masks)
@@ -47,26 +49,23 @@ def test_one_wrong_mask_cuts_nothing_off(stage, views, wrong):
     assert (found.far >= batch.depths)[seen].all()
 
 
-@pytest.mark.parametrize("views", [2, 3, 4, 5])
-@pytest.mark.parametrize("size", [(56, 56), (140, 98)])
-def test_right_masks_all_have_a_vote(views, size):
-    assert voting(make_batch(2, views, *size)) == [[True] * views] * 2
+#: Views, image size, defect of the last mask, options, and which of the views vote.
+VOTES = {
+    **{
+        f"right masks of {views} views": (views, size, None, {}, [True] * views)
+        for views in (2, 3, 4, 5)
+        for size in ((56, 56), (140, 98))
+    },
+    "an empty mask takes no vote away": (4, (56, 56), "empty", {}, [True] * 3 + [False]),
+    # with two views it is unknown which one is wrong
+    "a half of two": (2, (112, 112), "half", {}, [True, True]),
+    "a shifted one of two": (2, (112, 112), "shifted", {}, [True, True]),
+    # with a tolerance, its vote alone carves nothing; without it, the others would have to agree
+    "an outvoted one": (5, (112, 112), "half", {"tolerance": 1}, [True] * 5),
+}
 
 
-def test_an_empty_mask_has_no_vote_and_takes_none_away():
-    batch = make_batch(1, 4, 56, 56)
-    batch.masks[0, 1] = False
-    assert voting(batch) == [[True, False, True, True]]
-
-
-@pytest.mark.parametrize("wrong", ["half", "shifted"])
-def test_of_two_views_none_loses_its_vote(wrong):
-    """With two views it is unknown which one is wrong."""
-    assert voting(spoil(make_batch(1, 2, 112, 112), wrong)) == [[True, True]]
-
-
-def test_a_wrong_mask_that_is_outvoted_keeps_its_vote():
-    """With a tolerance, its vote alone carves nothing; without it, the others would have to agree."""
-    spoiled = spoil(make_batch(1, 5, 112, 112), "half")
-    assert voting(spoiled) == [[True] * 4 + [False]]
-    assert voting(spoiled, tolerance=1) == [[True] * 5]
+@pytest.mark.parametrize("name", VOTES)
+def test_which_masks_vote(name):
+    views, size, wrong, options, expected = VOTES[name]
+    assert voting(spoil(make_batch(1, views, *size), wrong), **options) == [expected]

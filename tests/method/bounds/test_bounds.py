@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import SubjectBox, VisualHull
 from ghgs_lit.method.bounds.box import subject_box
@@ -32,10 +31,15 @@ def inside(near, far, batch, slack=1e-4):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-@pytest.mark.parametrize(("views", "size"), [(2, (56, 56)), (3, (70, 42)), (4, (42, 56)), (5, (56, 56))])
-def test_true_depth_is_within_the_bounds(stage, views, size):
-    """Bounds that exclude the surface would make the true depth unreachable."""
-    batch = make_batch(2, views, *size, spread=180.0 if views == 2 else 360.0)
+@pytest.mark.parametrize(
+    ("views", "size", "zoom"),
+    [(2, (56, 56), 0.8), (3, (70, 42), 0.8), (4, (42, 56), 0.8), (5, (56, 56), 0.8), (4, (56, 56), 1.6)],
+)
+def test_true_depth_is_within_the_bounds(stage, views, size, zoom):
+    """Bounds that exclude the surface would make the true depth unreachable; with the last zoom, the frame
+    cuts the subject, and space outside a view's frame does not count as empty."""
+    batch = make_batch(2 - (zoom > 1), views, *size, spread=180.0 if views == 2 else 360.0, zoom=zoom)
+    assert batch.masks[:, :, 0].any() == (zoom > 1)
     near, far = near_and_far(stage(), batch)
     assert near.shape == far.shape == batch.masks.shape
     assert (near > 0).all()
@@ -64,24 +68,6 @@ def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
         lengths[stage] = (far - near)[batch.masks].mean()
     assert lengths[VisualHull] < 0.7 * lengths[SubjectBox]
     assert lengths[VisualHull] < 0.55  # the mean chord of the ellipsoid is about 0.3 m
-
-
-def test_the_box_holds_the_subject_and_little_more():
-    """The carved box neither cuts the subject nor keeps the empty space around it."""
-    batch = make_batch(2, 4, 112, 112)
-    lower, upper = subject_box(batch.masks, batch.cameras, radius=1)
-    assert (lower <= CENTER - RADII).all()
-    assert (upper >= CENTER + RADII).all()
-    assert (lower >= CENTER - RADII - 0.25).all()
-    assert (upper <= CENTER + RADII + 0.25).all()
-
-
-def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
-    """Space outside a view's frame does not count as empty."""
-    batch = make_batch(1, 4, 56, 56, zoom=1.6)
-    assert batch.masks[:, :, 0].any(), "the head must touch the border in this test"
-    for stage in STAGES:
-        assert inside(*near_and_far(stage(), batch), batch) == 1
 
 
 @pytest.mark.parametrize("view", [1, 3])
@@ -117,21 +103,8 @@ def test_an_empty_mask_does_not_vote(stage):
     masks = batch.masks.clone()
     masks[0, 1] = False
     near, far = near_and_far(stage(), batch, masks=masks)
-    assert near.isfinite().all()
-    assert far.isfinite().all()
-    assert (
-        inside(
-            near[:, [0, 2]],
-            far[:, [0, 2]],
-            type(batch)(
-                batch.images[:, [0, 2]],
-                batch.masks[:, [0, 2]],
-                batch.cameras[:, [0, 2]],
-                depths=batch.depths[:, [0, 2]],
-            ),
-        )
-        == 1
-    )
+    assert torch.stack((near, far)).isfinite().all()
+    assert inside(near, far, dataclasses.replace(batch, masks=masks)) == 1
     near, far = near_and_far(stage(), batch, masks=torch.zeros_like(masks))
     assert near.isfinite().all()
     assert (far > near).all()
@@ -192,9 +165,7 @@ def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
         odd = dataclasses.replace(cameras, **{name: changed})
         for stage in STAGES:
             near, far = near_and_far(stage(), batch, cameras=odd)
-            assert near.isfinite().all()
-            assert far.isfinite().all()
-            assert ((near > 0) & (far >= near)).all()
+            assert ((near > 0) & (far >= near) & far.isfinite()).all()
 
 
 def test_autocast_changes_nothing():
@@ -204,16 +175,6 @@ def test_autocast_changes_nothing():
     with torch.autocast("cpu", torch.bfloat16):
         found = near_and_far(VisualHull(), batch)
     assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("option", "key"),
-    [({"tolerance": -1}, "tolerance"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
-)
-def test_impossible_options_are_refused(option, key):
-    """An invalid value is rejected when the configuration is read, by key."""
-    with pytest.raises(InputError, match=rf"bounds\.{key}"):
-        VisualHull(**option)
 
 
 @pytest.mark.parametrize("size", [(40, 160), (160, 40)])
@@ -235,19 +196,17 @@ def test_the_box_has_a_margin_on_every_side(monkeypatch):
     torch.testing.assert_close(torch.stack((lower + 0.03, upper - 0.03)), torch.stack(expected))
 
 
-@pytest.mark.parametrize("stretch", [(2.0, 1.0), (1.0, 2.0)])
-def test_the_box_of_pixels_that_are_not_square(stretch):
-    """Images stretched along x or y give the same box for the same pole."""
-    radii = torch.tensor([0.1, 0.8, 0.1])
-    across, down = stretch
+@pytest.mark.parametrize(("across", "down", "slack"), [(1.0, 1.0, 0.0), (2.0, 1.0, 0.02), (1.0, 2.0, 0.02)])
+def test_the_box_holds_the_subject_and_little_more(across, down, slack):
+    """Also a pole in images stretched along x or y: pixels need not be square."""
+    radii = RADII if across == down else torch.tensor([0.1, 0.8, 0.1])
     focal, principal = (45 * across, 45 * down), (28 * across, 28 * down)
     place = {"center": tuple(CENTER.tolist()), "raised": 0.3, "radius": 2.0}
-    cameras = camera_ring(4, int(56 * down), int(56 * across), 1, focal, principal, **place)
-    lower, upper = subject_box(ellipsoid(cameras, radii=radii)[0], cameras, radius=0)
-    assert (lower <= CENTER - radii + 0.02).all()
-    assert (upper >= CENTER + radii - 0.02).all()
-    assert (lower >= CENTER - radii - 0.25).all()
-    assert (upper <= CENTER + radii + 0.25).all()
+    cameras = camera_ring(4, int(56 * down), int(56 * across), 2, focal, principal, **place)
+    lower, upper = subject_box(ellipsoid(cameras, radii=radii)[0], cameras, radius=int(across == down))
+    low, high = CENTER - radii, CENTER + radii
+    assert ((lower <= low + slack) & (lower >= low - 0.25)).all()
+    assert ((upper >= high - slack) & (upper <= high + 0.25)).all()
 
 
 def test_bounds_that_are_too_close_are_moved_apart_to_the_least_thickness():

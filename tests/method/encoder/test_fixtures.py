@@ -16,8 +16,8 @@ from ghgs_lit.method.encoder.block import REGISTERS, rotary_tables, rotate
 from ghgs_lit.method.encoder.vit import VisionTransformer
 from ghgs_lit.method.heads.dpt import DPTHead, add_positions_
 from ghgs_lit.method.plan.patches import KeptPatches
+from ghgs_lit.ops.activation import confidence_of
 from ghgs_lit.types import Tokens
-from tests.helpers.activations import split_activated
 from tests.helpers.encoders import make_encoder
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
@@ -136,8 +136,10 @@ def test_dpt(name, dtype):
     assert raw.shape == (b * v, case["options"]["output_dim"], height, width)
     if "activations" not in case:
         return _compare(name, groups, dtype, {"features": raw})
-    values, confidence = split_activated(raw, *case["activations"])
-    _compare(name, groups, dtype, {"preds": values, "conf": confidence})
+    assert case["activations"] == ["linear", "expp1"]
+    channels = raw.movedim(1, -1)
+    found = {"preds": channels[..., :-1], "conf": confidence_of(channels[..., -1])}
+    _compare(name, groups, dtype, found)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -152,14 +154,3 @@ def test_dpt_positions(dtype):
     }
     expected = groups[DTYPES[dtype]]
     _compare(name, groups, dtype, {key: value.to(expected[key].dtype) for key, value in found.items()})
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_activations(dtype):
-    """All activations of the dense heads reproduce the published numbers."""
-    name = "dpt_head_activations"
-    groups = _load(name)
-    raw = _inputs(groups, dtype)["raw"]
-    found = {f"preds_{a}": split_activated(raw, a)[0] for a in CASES[name]["activations"]}
-    found |= {f"conf_{a}": split_activated(raw, "linear", a)[1] for a in CASES[name]["conf_activations"]}
-    _compare(name, groups, dtype, found)

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.method.bounds import NoBounds, SubjectBox, VisualHull
@@ -127,17 +126,3 @@ def test_the_releases_parameterization_has_either_sign_and_no_bounds():
     assert maps.bounds is None
     values = torch.tensor([0.5, -0.5, 0.0])
     torch.testing.assert_close(inverse_linear(values), torch.tensor([2.0, -2.0, 1e8]))
-
-
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"parameterization": "linar"}, "depth_head.parameterization: expected one of bounded_inverse"),
-        ({"pixels": "all"}, "depth_head.pixels: expected one of .*; found 'pixels'"),
-        ({"start": 1.0}, "depth_head.start"),
-    ],
-)
-def test_impossible_options_are_refused(options, key):
-    """An invalid value is rejected when the configuration is read, by key."""
-    with pytest.raises(InputError, match=key):
-        make_head(**options)

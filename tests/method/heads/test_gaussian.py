@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.unprojection import Unprojection
@@ -152,38 +151,6 @@ def test_no_valid_pixel_gives_no_gaussians(parameterization):
     assert gaussians.splits == (0, 0)
     (gaussians.means.sum() + gaussians.scales.sum()).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in head.parameters())
-
-
-def test_attributes_are_wide_under_autocast():
-    """Means and scales in half precision would be off by centimetres."""
-    batch = make_batch()
-    head = shake(make_head())
-    expected = run(head, batch)
-    with torch.autocast("cpu", torch.bfloat16):
-        found = run(head, batch)
-    for name in ("means", "quaternions", "scales", "opacities", "colors"):
-        assert getattr(found, name).dtype == torch.float32
-    assert (found.means - expected.means).abs().max() < 0.001
-
-
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"parameterization": "ours"}, "gaussian_head.parameterization"),
-        ({"pixels": "all"}, "gaussian_head.pixels: expected one of .*; found 'pixels'"),
-        ({"hidden": [32]}, "gaussian_head.hidden"),
-        ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
-        ({"attributes": {"thickness_start": 0.0}}, "gaussian_head.attributes.thickness_start"),
-        ({"attributes": {"thickness_start": 5.0}}, "gaussian_head.attributes.thickness_start"),
-        ({"attributes": {"inward": -1.0}}, "gaussian_head.attributes.inward"),
-        ({"axes": "camera"}, "gaussian_head.axes"),
-        ({"attributes": {"opacity_floor": 0.8}}, "gaussian_head.attributes.opacity_floor"),
-    ],
-)
-def test_impossible_options_are_refused(options, key):
-    """An invalid value is rejected when the configuration is read, by key."""
-    with pytest.raises(InputError, match=key):
-        make_head(**options)
 
 
 def test_the_last_projection_is_wide_under_autocast():

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.frame import places_around
 from ghgs_lit.method.plan import make_plan
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
@@ -114,8 +113,3 @@ def test_half_precision_keeps_places_exact():
         found = stage(tokens, points)
     assert {value.dtype for value in seen} == {torch.float32}
     assert found.latent[0].dtype == torch.float32
-
-
-def test_image_planes_have_no_places():
-    with pytest.raises(InputError, match=r"recalibration.positions: expected none with neighborhood=image_"):
-        make_stage(positions="relative", neighborhood="image_plane")

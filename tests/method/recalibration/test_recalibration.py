@@ -6,7 +6,6 @@ from typing import get_args
 import pytest
 import torch
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.method.recalibration.inspection import collect_calls, shared_neighbors
 from ghgs_lit.method.recalibration.recalibration import (
@@ -144,34 +143,6 @@ def test_blocks_of_queries_change_nothing(monkeypatch):
     with torch.no_grad():
         found = module(tokens, points)
     torch.testing.assert_close(found.latent[3], expected.latent[3], atol=1e-6, rtol=0)
-
-
-def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
-    """Autocast changes neither the neighbours nor the dtype of the tokens."""
-    tokens, points = scene()
-    expected = make_stage()(tokens, points)
-    with torch.autocast("cpu", torch.bfloat16):
-        found = make_stage()(tokens, points)
-    assert found.latent[0].dtype == torch.float32
-    assert (found.latent[0] - expected.latent[0]).abs().max() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"k": 0}, "recalibration.k"),
-        ({"k": 1.5}, "recalibration.k"),
-        ({"similarity": "cosine"}, "recalibration.similarity: expected one of product"),
-        ({"neighborhood": "feature"}, "recalibration.neighborhood: expected one of xyz, image_plane"),
-        ({"neighbors": "all"}, "recalibration.neighbors: expected one of .*found 'neighbors'"),
-        ({"tokens": "most"}, "recalibration.tokens"),
-        ({"num_heads": 5}, "recalibration.num_heads"),
-    ],
-)
-def test_impossible_options_are_refused(options, key):
-    """Impossible options are rejected by key."""
-    with pytest.raises(InputError, match=key):
-        make_stage(**options)
 
 
 @pytest.mark.parametrize("similarity", SIMILARITIES)

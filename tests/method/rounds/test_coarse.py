@@ -29,6 +29,7 @@ def recurrent(height, *overrides):
     small = ("rounds.hidden=16", "rounds.depths=4", f"rounds.height={height}")
     model = make_model("model=recurrent", "skip=exact", *small, *overrides).eval()
     torch.nn.init.normal_(model.rounds.change[-1].weight, std=0.5)
+    torch.nn.init.normal_(model.rounds.exchange.hear.weight, std=0.5)
     return model
 
 

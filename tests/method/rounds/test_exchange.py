@@ -57,23 +57,17 @@ def expected(exchange, raw, known):
     return known.numpy() + np.maximum(rows, 0) @ hear[0].T + hear[1]
 
 
-def test_windows_give_what_whole_images_give():
-    raw, batch = scene(blobs())
-    known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
-    windows = Windows.of(raw, batch)
-    assert windows.shape == (3, 10, 13)
-    found = exchange(known, windows)
-    assert np.allclose(found.detach().numpy(), expected(exchange, raw, known), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("filled", [[], [1]])
-def test_images_without_a_subject(filled):
+@pytest.mark.parametrize(
+    ("filled", "shape"), [([0, 1, 2], (3, 10, 13)), ([1], (3, 10, 8)), ([], (3, 1, 1))], ids=str
+)
+def test_windows_give_what_whole_images_give(filled, shape):
+    """Also for images without a subject."""
     masks = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.bool)
     masks[filled] = blobs()[filled]
     raw, batch = scene(masks)
     known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
     windows = Windows.of(raw, batch)
-    assert windows.shape == ((3, 10, 8) if filled else (3, 1, 1))
+    assert windows.shape == shape
     found = exchange(known, windows).detach().numpy()
     assert found.shape == known.shape
     assert np.allclose(found, expected(exchange, raw, known), rtol=0, atol=1e-12)

@@ -10,7 +10,7 @@ import torch
 from ghgs_lit.data.imperfections import sample_color_gains
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.rounds.gains import divide_by_gains, equalize, log_gains, log_gammas
-from tests.helpers.models import make_model, predict
+from tests.helpers.models import make_model
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, surface_splats, with_soft_rims
 
 
@@ -130,19 +130,6 @@ def test_photographs_that_say_nothing_have_no_gains(value):
     assert not log_gains(surface_splats(flat), flat).any()
     nothing = surface_splats(batch).select(slice(0, 0), (0,))
     assert not log_gains(nothing, batch).any()
-
-
-def test_the_model_equalizes_before_its_rounds():
-    """The Gaussians' colours are those of the corrected images; without the option they are not."""
-    batch = painted_batch()
-    dark = seen_with(batch, sample_gains(batch))
-    models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]
-    with torch.no_grad():
-        plain, equal = (predict(model.eval(), dark) for model in models)
-    photos = dark.images.flatten(0, 1).flatten(2).mT
-    own = photos[plain.gaussians.image, plain.gaussians.pixel]
-    torch.testing.assert_close(plain.gaussians.colors, own)
-    assert (equal.gaussians.colors - own).abs().max() > 0.02
 
 
 def test_photographs_that_are_divided_already_are_not_equalized_again():

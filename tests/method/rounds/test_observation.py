@@ -58,17 +58,6 @@ def test_outside_of_all_images_everything_is_0(means):
     assert not each[each[..., 9] == 0][:, :9].any()
 
 
-def test_what_is_not_finite_reaches_no_other_element():
-    batch = make_batch(3, 2)
-    gaussians = surface_splats(batch)
-    expected = observe(gaussians, batch)
-    colors = gaussians.colors.clone()
-    element = gaussians.image // 2
-    colors[element == 1] = torch.nan
-    found = observe(dataclasses.replace(gaussians, colors=colors), batch)
-    torch.testing.assert_close(found[element != 1], expected[element != 1], rtol=0, atol=1e-5)
-
-
 def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
     """Gaussians have the subject's colours and the matte as opacity; the matte replaces the mask."""
     batch = with_soft_rims(make_batch(1, 2))
