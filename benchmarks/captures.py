@@ -38,7 +38,6 @@ from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -139,14 +138,13 @@ def batches(
     clean: PhotographsDataModule,
     own: PhotographsDataModule,
     size: tuple[int, int],
-    refine_masks: int,
 ) -> Iterator[Batch]:
     """Crops of ``size`` of the photographs of a capture, with the targets of the clean rig."""
     targets = [read_option("targets", name) for name in _TARGETS]
     for batch in clean.evaluation_loader(_VIEWS, targets, batch_size=1):
         subject = batch.subjects[0]
         taken = photograph(capture, own.evaluation_batch(subject, views=_VIEWS))
-        seen = taken.batch(size, refine_masks)
+        seen = taken.batch(size)
         cameras = seen.cameras.to(torch.float32)  # for baselines
         yield dataclasses.replace(seen, cameras=cameras, targets=batch.targets)
 
@@ -263,8 +261,6 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--size", type=int, help="side in pixels; none: the checkpoint's")
-    parser.add_argument("--refine-masks", type=int, default=0, help="pixels that masks may be off by")
-    parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
     parser.add_argument("--mend", action="store_true", help="what predict mends by itself, and nothing else")
     parser.add_argument("--first", type=int, default=0, help="with --mend: people before it take no part")
     options = parser.parse_args()
@@ -276,15 +272,13 @@ def main() -> None:
         measure_mending(options, size, run, device)
         return
     renderer, model = build_renderer(run, device), Predictor.from_checkpoint(options.checkpoint, device)
-    rounds = options.refine_cameras
-    cameras = CameraRefinement(rounds, model, renderer) if rounds else None
-    method, metrics = ModelMethod(model, renderer, cameras=cameras), run.metrics.build().to(device)
+    method, metrics = ModelMethod(model, renderer), run.metrics.build().to(device)
     clean = data_of(CAPTURES["clean"], options.people, list(size), _UNEVEN)
     larger = [_LARGER * side for side in size]
     results = {}
     for name, capture in CAPTURES.items():
         own = data_of(capture, options.people, larger, _UNEVEN)
-        seen = batches(capture, clean, own, size, options.refine_masks)
+        seen = batches(capture, clean, own, size)
         results[name] = means(measure(method, name, seen, metrics, device))
     print(f"{options.people} people, {size[0]} x {size[1]}\n{table(results)}")
 
