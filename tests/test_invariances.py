@@ -8,9 +8,9 @@ from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.ops.attention import cpu
 from ghgs_lit.ops.compile import processor_features
 from ghgs_lit.ops.neighbors import nearest_neighbors, neighbor_cosines
-from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
+from tests.helpers.tokens import literal_attention
 
 
 @pytest.mark.parametrize("name", ["paper", "recurrent"])
@@ -58,7 +58,7 @@ def recalibration(g):
     @torch.no_grad()
     def plain(dtype):
         with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            return literal_recalibration(block, x, points, semantic, 8)
+            return literal_attention(block, x, points, semantic, 8)
 
     return ours, plain
 

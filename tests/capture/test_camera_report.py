@@ -5,10 +5,66 @@ import pytest
 
 from ghgs_capture.camera_report import diagnose
 from ghgs_capture.folder import CaptureFolder
-from ghgs_lit.data.view import area_mask
-from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
 from tests.helpers.figures import Figure, camera_as_stored, write_turned
-from tests.helpers.mistakes import ALL, ONE
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+def pose(change):
+    """A mistake in the pose of a camera."""
+    return lambda c: {**c, "extrinsics": change(np.array(c["extrinsics"])).tolist()}
+
+
+def lens(change):
+    """A mistake in the intrinsics of a camera."""
+    return lambda c: {**c, "intrinsics": change(np.array(c["intrinsics"]), c).tolist()}
+
+
+def longer(factor):
+    return pose(lambda e: np.block([[e[:3, :3], e[:3, 3:] * factor], [e[3:]]]))
+
+
+def scaled(factor):
+    return lens(lambda k, c: k * [[factor], [factor], [1]])
+
+
+def turned(degrees):
+    a = np.radians(degrees)
+    turn = np.array([[np.cos(a), 0, np.sin(a), 0], [0, 1, 0, 0], [-np.sin(a), 0, np.cos(a), 0], [0, 0, 0, 1]])
+    return pose(lambda e: turn @ e)
+
+
+NORMALIZED = lens(lambda k, c: k / [[c["width"]], [c["height"]], [1]])
+PRINCIPAL = lens(lambda k, c: k / [[1, 1, c["width"]], [1, 1, c["height"]], [1, 1, 1]])
+SHIFTED = lens(lambda k, c: k + np.array([[0, 0, 0.1 * c["width"]], [0, 0, 0.05 * c["height"]], [0, 0, 0]]))
+INVERSE, OPENGL = pose(np.linalg.inv), pose(lambda e: FLIP @ e)
+
+# Mistakes of all cameras, with the option that corrects them.
+ALL = {
+    "inverse": (INVERSE, "calibration.extrinsics=camera_to_world"),
+    "axes": (OPENGL, "calibration.axes=opengl"),
+    "blender": (
+        pose(lambda e: np.linalg.inv(e) @ FLIP),
+        "calibration.extrinsics=camera_to_world calibration.axes=opengl",
+    ),
+    "normalized": (NORMALIZED, "calibration.intrinsics=normalized"),
+    "normalized principal point": (PRINCIPAL, "calibration.intrinsics=normalized_principal"),
+    "photographs halved": (scaled(2), "calibration.resized=0.5"),
+    "inverse and photographs doubled": (
+        lambda c: INVERSE(scaled(0.5)(c)),
+        "calibration.extrinsics=camera_to_world calibration.resized=2",
+    ),
+}
+# Mistakes of one camera of four.
+ONE = {
+    "inverse": INVERSE,
+    "axes": OPENGL,
+    "millimetres": longer(1000),
+    "principal point": SHIFTED,
+    "size": scaled(2),
+    "turned by 6 degrees": turned(6),
+    "other lens": scaled(1.3),
+}
 
 
 def examine(folder, cameras=None, figure=None, **options):
@@ -99,30 +155,6 @@ def test_right_captures_raise_no_alarm(tmp_path, seed):
     found = examine(tmp_path, figure=figure)
     assert found.consistent, found.line
     assert found.line.endswith("units tall")
-
-
-def coarse(photograph, cells):
-    """Silhouette of a photograph with at most ``cells`` pixels along its longer side."""
-    shape = np.array(photograph.mask.shape)
-    size = np.maximum(np.round(shape * min(cells / shape.max(), 1)).astype(int), 1)
-    intrinsics = photograph.intrinsics.copy()
-    intrinsics[:2] *= (size / shape)[::-1, None]
-    return Silhouette(area_mask(photograph.mask, *size.tolist()), intrinsics, photograph.extrinsics)
-
-
-def test_agreement_is_the_share_of_a_mask_within_the_hull(tmp_path):
-    """The half of a mask that is moved out of the others' view no longer agrees."""
-    figure = Figure()
-    right = Figure()
-    rows = np.flatnonzero(figure.masks[1].any(1))
-    middle = int(np.median(rows))
-    figure.masks[1][:middle] = False
-    figure.write(tmp_path)
-    photographs = CaptureFolder(tmp_path, tmp_path / "cameras.json").photographs(tmp_path.name)
-    shares = np.array(HullSearch().shares([coarse(photograph, 128) for photograph in photographs]))
-    assert shares[1] == 1
-    below = right.masks[[0, 2, 3], middle:].sum((1, 2)) / right.masks[[0, 2, 3]].sum((1, 2))
-    assert shares[[0, 2, 3]] == pytest.approx(below, abs=0.12)
 
 
 #: Parts of a mask: the first and the last of its rows, as shares of its height.

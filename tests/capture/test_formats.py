@@ -101,11 +101,6 @@ def test_files_of_programs(tmp_path, name):
     check(WRITERS[name](tmp_path))
 
 
-def test_own_json_has_the_size_of_photographs(tmp_path):
-    stored = json.loads(own_json(tmp_path).read_text())["cameras"]
-    assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}
-
-
 @pytest.mark.parametrize("place", ["", "intri.yml", "extri.yml"])
 def test_easymocap(tmp_path, place):
     """Both the rotation vector R and the matrix Rot are written; numbers are valid names."""

@@ -8,7 +8,6 @@ import pytest
 from ghgs_lit.config import build, compose
 from ghgs_lit.data.sampling import (
     TargetProtocol,
-    subject_rng,
 )
 from ghgs_lit.errors import InputError
 from ghgs_people import figures
@@ -136,13 +135,6 @@ def test_the_cache_is_named_after_every_setting(tmp_path):
 def test_impossible_people_are_refused(tmp_path, changes, line):
     """Views that are not rendered, invalid numbers of people, misspelt keys."""
     refused(line, lambda: synthetic(tmp_path, **changes))
-
-
-def test_rig_draws_do_not_depend_on_other_subjects():
-    """A subject does not depend on the other subjects."""
-    a, b = RIG.yaws(subject_rng(0, "a")), RIG.yaws(subject_rng(0, "b"))
-    assert not np.allclose(a, b)
-    np.testing.assert_array_equal(a, RIG.yaws(subject_rng(0, "a")))
 
 
 def test_a_user_without_a_home_learns_where_to_keep_people(monkeypatch):

@@ -1,6 +1,8 @@
-"""``auto`` corrects what a capture contradicts; an exact capture is predicted unchanged, bit for bit."""
+"""``auto`` corrects masks, cameras and tone curves that a capture contradicts; an exact capture is predicted
+unchanged, bit for bit."""
 
 import dataclasses
+import json
 import re
 
 import numpy as np
@@ -15,6 +17,7 @@ from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.masks import signed_distance
 from tests.helpers.figures import Figure
 from tests.helpers.models import make_model
+from tests.helpers.verbs import ghgs
 
 SIZE = (112, 84)
 
@@ -112,3 +115,93 @@ def test_what_is_doubted_is_refined(taken, monkeypatch):
     cameras = predict(taken, model, 56)
     assert cameras.why == {"refine_cameras": "they are off"}
     assert len(cameras.moved) == 4
+
+
+KEYS = {"size": 112, "refine_cameras": 0, "refine_masks": 0}
+NAMES = ["cam0", "cam1", "cam2", "cam3"]
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("taken")
+    return Capture.read(folder, Figure().write(folder))
+
+
+def seen_with(capture, gammas, gains=(1, 1, 1, 1)):
+    """Apply powers and gains to the colours of a capture's photographs."""
+    photographs = []
+    for photograph, gamma, gain in zip(capture.photographs, gammas, gains, strict=False):
+        colors = np.clip(gain * (photograph.image / 255) ** gamma, 0, 1)
+        photographs.append(dataclasses.replace(photograph, image=np.round(255 * colors).astype(np.uint8)))
+    return dataclasses.replace(capture, photographs=tuple(photographs))
+
+
+@pytest.mark.parametrize("gamma", [0.8, 1.2])
+@pytest.mark.parametrize("view", range(4))
+def test_the_gamma_of_one_camera_is_named_and_undone(exact, view, gamma):
+    """The model's inputs equal those without the gamma, up to estimation and rounding."""
+    gammas = [gamma if place == view else 1.0 for place in range(4)]
+    result = predict(seen_with(exact, gammas), **KEYS)
+    assert result.tones == {NAMES[view]: pytest.approx(gamma, rel=0.03)}
+    right = exact.batch((112, 112)).images
+    assert (result.batch.images - right).abs().max() < 0.02
+
+
+ALIKE = [1.0] * 4
+#: Number of photographs, powers and gains of each camera.
+NO_TONES = {
+    "the same exposure": (4, ALIKE, (1, 1, 1, 1)),
+    "one dark camera": (4, ALIKE, (0.7, 1, 1, 1)),
+    "different exposures": (4, ALIKE, (0.6, 0.9, 1.1, 0.75)),
+    "coloured light": (4, [1.0, np.array([1.2, 1.2, 1 / 1.2]), 1.0, 1.0], (1, 1, 1, 1)),
+    "two photographs do not tell which one it is": (2, [1.2, 1.0], (1, 1)),
+}
+
+
+@pytest.mark.parametrize("name", NO_TONES)
+def test_what_is_no_tone_curve_of_one_camera_stays_as_it_is(exact, name):
+    """Bit for bit equal to the prediction without the search."""
+    count, gammas, gains = NO_TONES[name]
+    given = seen_with(dataclasses.replace(exact, photographs=exact.photographs[:count]), gammas, gains)
+    found, plain = predict(given, **KEYS), predict(given, **KEYS, tones={})
+    assert found.tones == plain.tones == {}
+    assert torch.equal(found.batch.images, plain.batch.images)
+    assert torch.equal(found.gaussians.means, plain.gaussians.means)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with two instants, in which cam2 has a gamma of 0.8, and their cameras."""
+    monkeypatch.chdir(tmp_path)
+    for instant in ("000", "001"):
+        figure = Figure()
+        figure.images[2] = np.round(255 * (figure.images[2] / 255) ** 0.8)
+        cameras = figure.write(tmp_path / "images" / instant)
+    return f"cameras={cameras}", "device=cpu"
+
+
+PREDICTED = (
+    "out=splats",
+    "size=112",
+    "formats=[ply]",
+    "turntable.frames=0",
+    "refine_masks=0",
+    "refine_cameras=0",
+)
+LINE = "photograph cam2 has a gamma of about 0.80 beside the others: undone (refine_tones=0 leaves it)\n"
+
+
+@pytest.mark.parametrize(("images", "folders"), [("images/000", ["."]), ("images", ["000", "001"])])
+def test_predict_says_what_it_undoes_once_and_reports_it_of_each_instant(here, capsys, images, folders):
+    assert ghgs("predict", f"images={images}", *here, *PREDICTED) == 0
+    assert capsys.readouterr().out.count(LINE) == 1
+    for folder in folders:
+        with open(f"splats/{folder}/report.json") as file:
+            assert json.load(file)["tones"] == {"cam2": pytest.approx(0.8, rel=0.03)}
+
+
+def test_predict_leaves_what_it_is_told_to_leave(here, capsys):
+    assert ghgs("predict", "images=images/000", *here, *PREDICTED, "refine_tones=0") == 0
+    assert "gamma" not in capsys.readouterr().out
+    with open("splats/report.json") as file:
+        assert "tones" not in json.load(file)
