@@ -65,7 +65,6 @@ SMALL = [
     (r"(?<=runs=runs/train/)(<sweep>|mine|models)", "paper", "a small sweep"),
     (r"(?<=data\.root=)\.\.\.", "zju", "a miniature"),
     (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "next to the miniature"),
-    (r"their_results\.json", "docs/example_others.json", "a complete file"),
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1 data.render_workers=0",
      "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),

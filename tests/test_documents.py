@@ -43,7 +43,7 @@ OPTIONS = {
     "hydra/launcher": {"joblib", "submitit_local"},
 }
 # a group of entry points, and a file format
-NO_MODULES = {"ghgs_lit.plugins", "ghgs_lit.others"}
+NO_MODULES = {"ghgs_lit.plugins"}
 
 
 def _script(name: str):

@@ -14,7 +14,7 @@ from ghgs_lit.data.decoding import read_array, read_image
 from ghgs_lit.data.layout import Completeness
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables import read_others, read_sweep
+from ghgs_lit.evaluation.tables import read_sweep
 from ghgs_lit.parsing import (
     LARGEST,
     find_path,
@@ -149,7 +149,6 @@ def test_foreign_content_of_files_of_this_program(tmp_path):
             Completeness(tmp_path), {"render": {"lights": "none"}}
         ),
         tmp_path / "metrics.json": lambda: read_results(tmp_path / "metrics.json"),
-        tmp_path / "other.json": lambda: read_others(tmp_path / "other.json"),
     }
     for (path, read), content in itertools.product(readers.items(), FOREIGN):
         path.write_bytes(content)

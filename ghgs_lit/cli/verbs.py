@@ -128,8 +128,6 @@ class Table(Verb):
     ssim, lpips (flip where a run lacks lpips)."""
     by: Texts = ()
     """Configuration keys whose values get separate rows, such as [optimizer.lr]."""
-    others: PathText | tuple[PathText, ...] = ()
-    """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
     reported: bool = True
     """Also print the numbers reported in the paper (not with layout=ablation)."""
     unit: Text | None = None

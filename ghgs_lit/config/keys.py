@@ -24,14 +24,11 @@ MAY_CHANGE_ON_RESUME = (
 #: and the evaluation.
 NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 
-#: Keys of views and targets that affect training.
-OF_TRAINING = ("views.training_counts", "views.training", "targets.training_views", "targets.per_step")
-#: Keys that change the targets of a protocol without changing its name.
-OF_TARGETS = ("targets.kind", "targets.view", "targets.positions", "targets.per_subject")
-
-#: Keys that may differ between the runs of a table row: those without influence, the seed, and
-#: views, targets and metrics, which tables distinguish otherwise.
-OF_A_RUN = (*WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "seed", "targets", "views")
+#: Keys that may differ between the runs of a table row: those without influence, the seed, and what
+#: tables distinguish otherwise.
+OF_A_RUN = (
+    *WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "seed", "targets.name", "views.evaluation_count",
+)  # fmt: skip
 #: Keys of files and machines, which differ if the same run is repeated elsewhere.
 OF_A_PLACE = ("checkpoint", "data.root", "data.source", "init_from", "trainer.accelerator")
 #: Keys that may differ between the runs of a table: :data:`OF_A_RUN` and the switches of the ablation.

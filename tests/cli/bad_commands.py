@@ -151,7 +151,6 @@ NUMBERS = [
     ("table runs={tmp} by=[seed,seed]", 1, "by: expected different values"),
     ("prepare task=check data=scans data.root={loop}", 1, "{loop}: expected", "links in a loop"),
     ("table runs={loop}", 1, "{loop}: expected", "links in a loop"),
-    ("table runs=x 'others=[\"~nobody-here/x\"]'", 1, "others: expected a path or a list (each a path)"),
     ("train data=scans 'data.root=\"~nobody-here/x\"'", 1, "~nobody-here/x: expected the folder"),
     (
         "predict images={empty} 'cameras=\"~nobody-here/x\"'",
@@ -187,8 +186,6 @@ NAMES = [
     ("evaluate data=synthetic baselines=[white]", 1, "baselines: expected one of black", "'white'"),
     ("evaluate checkpoint={ckpt} data=synthetic precision=int8", 1, "precision: expected one of", "'int8'"),
     ("prepare task=paint", 1, "task: expected one of render, check; found 'paint'"),
-    ("table runs={tmp} unit=x", 1, "unit: expected a regular expression with a group"),
-    ("table runs={tmp} 'unit=\"(\"'", 1, "unit: expected a regular expression"),
 ]
 
 FOREIGN = [
@@ -205,7 +202,6 @@ FOREIGN = [
     ("import out={tmp}/x.ckpt vggt={text} encoder=vggt_nano compat=none", 1, "{text}: expected weights"),
     ("table runs={text}", 1, "{text}: expected a directory of runs; found a file"),
     ("table runs={broken}", 1, "{broken}/run/metrics.json: expected"),
-    ("table runs={empty} others={text} layout=table1", 1, "{text}: expected"),
     ("prepare data=thuman2 data.source={empty} data.root={tmp}/o data.split={text}", 1, "{empty}"),
 ]
 

@@ -70,6 +70,6 @@ def write_run(
     return write_results(folder, rows, source)
 
 
-def tables_of(folder: Path, layout="ablation", by=(), others=(), **options):
+def tables_of(folder: Path, layout="ablation", by=(), **options):
     """Build the tables of the runs below a folder."""
-    return t.build_tables(t.read_sweep([folder], by), others, t.LAYOUTS[layout], **options)
+    return t.build_tables(t.read_sweep([folder], by), t.LAYOUTS[layout], **options)

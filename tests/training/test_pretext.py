@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.variants import model_variant
+from ghgs_lit.evaluation.tables.runs import model_variant
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.method.encoder.semantic import SemanticOptions
 from ghgs_lit.method.plan.patches import KeptPatches

@@ -1,19 +1,17 @@
-"""Assembly of tables from measurements: selection of runs, rows and columns."""
+"""Tables from runs: selection of runs, rows, columns and cells."""
 
-import itertools
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import compress, product
 from typing import Any
 
 import pandas as pd
 
 from ghgs_lit.config.keys import ABLATIONS
-from ghgs_lit.errors import InputError, require, require_choice
+from ghgs_lit.errors import require, require_choice
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Group, Layout, Line, Table, data_title, paper
-from ghgs_lit.evaluation.tables.runs import SETTING, Sweep
-from ghgs_lit.evaluation.tables.variants import Variant
+from ghgs_lit.evaluation.tables.runs import OF_TRAINING_TARGETS, SETTING, Sweep, Variant
 
 BASELINES = {
     "black": "Black image",
@@ -26,28 +24,23 @@ BASELINES = {
 }
 #: Titles of models that are modelled on other methods.
 PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
-#: Kinds of measured rows from top to bottom.
-_KINDS = ("baseline", "other", "model")
 #: Columns of measurements that are not metrics.
-_FACTS = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject"}
-_FACTS |= {"count", "origin", "trained"}
+_FACTS = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject", "trained"}
 
 
 def build_tables(
     sweep: Sweep,
-    others: Sequence[pd.DataFrame],
     layout: Layout,
     views: Sequence[int] | None = None,
     targets: Sequence[str] | None = None,
     metrics: Sequence[str] | None = None,
     reported: bool = True,
-    unit: re.Pattern[str] | None = None,
+    unit: str | None = None,
 ) -> list[Table]:
     """Build the tables of a sweep: one for each setting and, if rows are ablations, each model.
 
     Args:
-        sweep: Our runs.
-        others: Results of other methods, one frame for each file.
+        sweep: Runs.
         layout: Rows and columns.
         views: Numbers of input views; None: those of the layout.
         targets: Target protocols; None: those of the runs.
@@ -60,65 +53,52 @@ def build_tables(
         Tables in the order in which their settings first appear.
 
     Raises:
-        InputError: Nothing was measured on these targets, two runs have the same cell, configurations
-            in a cell differ, or results of other methods fit no table.
+        InputError: Nothing was measured on these targets, two runs have the same cell, or
+            configurations in a cell differ.
     """
-    if others and layout.rows == "ablation":
-        raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")
     layout = layout._replace(views=tuple(views or layout.views))
-    sweep = _select_runs(sweep, layout)
-    ours = _select(sweep.rows, "targets", targets) if targets else sweep.rows
-    rows = pd.concat([ours, *others], ignore_index=True)
-    known = [name for name in rows if name not in _FACTS and rows[name].notna().any()]
+    rows = _select(sweep.rows, layout, targets)
+    is_planned = rows["subject"].isna()
+    measured = rows[~is_planned]
     for name in metrics or ():
-        require_choice("columns", name, tuple(known))
-    same = [name for name in SETTING if layout.columns != "data" or name != "data"]
-    if layout.rows == "ablation":
-        rows["trained"] = [variant.trained for variant in rows["variant"]]
-        same.append("trained")
-    parts = [part for _, part in rows.groupby(same, sort=False) if part.index[0] < len(ours)]
-    shown = set().union(*(part["source"] for part in parts))
-    for source, theirs in rows[len(ours) :].groupby("source", sort=False):
-        if source not in shown:
-            keys = [_describe(part, same) for part in parts]
-            raise InputError(f"{source}: expected results on one of {keys}; found {_describe(theirs, same)}")
-    return [_build_table(part, sweep, layout, metrics, reported, unit) for part in parts]
+        known = [name for name in measured if name not in _FACTS and measured[name].notna().any()]
+        require_choice("columns", name, known)
+    # Columns of a planned run that decide to which table it belongs.
+    known_before = ["data"] * (layout.columns != "data") + ["trained"] * (layout.rows == "ablation")
+    tables = []
+    finished = set(sweep.rows["source"][sweep.rows["subject"].notna()]) & sweep.configs.keys()
+    left_out = len(finished - set(measured["source"]))
+    for _, part in measured.groupby([*known_before, *SETTING[1:]], sort=False):
+        planned = rows[is_planned]
+        for name in known_before:
+            planned = planned[planned[name].isin(part[name])]
+        tables.append(_build_table(part, planned, sweep, layout, left_out, metrics, reported, unit))
+    return tables
 
 
-def _describe(rows: pd.DataFrame, names: list[str]) -> str:
-    return ", ".join(f"{name}={rows.iloc[0][name]}" for name in names)
+def _select(rows: pd.DataFrame, layout: Layout, targets: Sequence[str] | None) -> pd.DataFrame:
+    """Select rows, planned ones too, by views, targets, and if any has, the paper's data.
 
-
-def _select(rows: pd.DataFrame, name: str, values: Sequence[Any]) -> pd.DataFrame:
-    """Rows with one of some numbers of views, or targets."""
-    chosen = rows[rows[name].isin(values)]
-    known = ", ".join(map(str, rows[name].unique()))
-    require(len(chosen), f"evaluation.{name}", f"some of {known}, as the runs were measured", list(values))
-    return chosen
-
-
-def _select_runs(sweep: Sweep, layout: Layout) -> Sweep:
-    """Select the runs of a layout.
-
-    They have its numbers of views and, if any run has, the paper's data. Tables of ablations exclude
-    baselines; tables of methods exclude the paper's ablations.
+    Tables of ablations exclude baselines; tables of methods exclude the paper's ablations.
     """
-    rows = _select(sweep.rows, "views", layout.views)
-    on_paper = _find_reported_data(layout)
-    has_papers = any(data_title(name) in on_paper for name in rows["data"])
-
-    def belongs(variant: Variant, data: str) -> bool:
-        if has_papers and data_title(data) not in on_paper:
-            return False
-        if layout.rows == "ablation":
-            return variant.kind == "model"
-        return variant.kind != "model" or variant.ablation == "full" or variant.is_own
-
-    rows = rows[list(map(belongs, rows["variant"], rows["data"]))]
-    require(len(rows), "runs", f"runs of layout={layout.name}", "baselines or the paper's ablations only")
-    planned = [run for run in sweep.planned if belongs(run.variant, run.data)]
-    planned = [run for run in planned if set(run.views) & set(layout.views)]
-    return replace(sweep, rows=rows, planned=planned)
+    for name, values in {"views": layout.views, "targets": targets}.items():
+        measured = rows[name][rows["subject"].notna()]
+        if values:
+            expected = f"some of {', '.join(map(str, measured.unique()))}, as the runs were measured"
+            require(measured.isin(values).any(), f"evaluation.{name}", expected, list(values))
+            rows = rows[rows[name].isin(values) | rows[name].isna()]
+    on_paper = rows["data"].map(data_title).isin(_find_reported_data(layout))
+    if (on_paper & rows["subject"].notna()).any():
+        rows = rows[on_paper]
+    variants = rows["variant"]
+    if layout.rows == "ablation":
+        belongs = [variant.kind == "model" for variant in variants]
+    else:
+        belongs = [variant.ablation in ("", "full") or variant.is_own for variant in variants]
+    rows = rows[belongs].assign(trained=[variant.trained for variant in variants[belongs]])
+    expected = f"runs of layout={layout.name}"
+    require(rows["subject"].notna().any(), "runs", expected, "baselines or the paper's ablations only")
+    return rows
 
 
 def _find_reported_data(layout: Layout) -> list[str]:
@@ -128,40 +108,46 @@ def _find_reported_data(layout: Layout) -> list[str]:
 
 def _build_table(
     rows: pd.DataFrame,
+    planned: pd.DataFrame,
     sweep: Sweep,
     layout: Layout,
+    left_out: int,
     metrics: Sequence[str] | None,
     reported: bool,
-    unit: re.Pattern[str] | None,
+    unit: str | None,
 ) -> Table:
-    is_ablation = layout.rows == "ablation"
-    trained = {variant.trained for variant in rows["variant"]}
-    planned = [run for run in sweep.planned if layout.columns == "data" or run.data in set(rows["data"])]
-    planned = [run for run in planned if not is_ablation or run.variant.trained in trained]
-    if metrics is None:
+    if not metrics:
         models = rows[[variant.kind == "model" for variant in rows["variant"]]]
         models = rows if models.empty else models
         has_lpips = "lpips" in models and models.groupby("source")["lpips"].count().all()
         metrics = ("psnr", "ssim", "lpips" if has_lpips else "flip")
-    variants = dict.fromkeys([*rows["variant"], *(run.variant for run in planned)])
-    variants = sorted(variants, key=lambda variant: _KINDS.index(variant.kind))
-    reported_data = _find_reported_data(layout) if reported else []
-    published = list(map(_reported_variant, paper()["tables"][layout.name]["rows"])) if reported_data else []
-    stub, lines = (_name_ablations if is_ablation else _name_methods)(published, variants)
-    groups = _make_groups(layout, [*rows["data"], *(run.data for run in planned)], reported_data)
-    left_out = len(sweep.configs.keys() - set(sweep.rows["source"]))
-    table = Table(layout, rows, planned, sweep.configs, stub, groups, list(metrics), lines, left_out, unit)
-    table.reported_on = " and ".join(reported_data)
-    fill(table)
+    every = pd.concat([rows, planned])
+    reported_on = _find_reported_data(layout) if reported else []
+    published = list(map(_reported_variant, paper()["tables"][layout.name]["rows"])) if reported_on else []
+    variants = sorted(every["variant"].unique(), key=lambda variant: variant.kind)  # baselines, then models
+    stub, lines = (_name_ablations if layout.rows == "ablation" else _name_methods)(published, variants)
+    groups = _make_groups(layout, every["data"].unique(), reported_on)
+    protocol = rows["targets"].iloc[0]
+    configs = {path: _without_other_targets(config, protocol) for path, config in sweep.configs.items()}
+    table = Table(layout, rows, planned, configs, left_out, list(metrics), reported_on, groups, stub, lines)
+    fill(table, unit)
     return table
 
 
-def _make_groups(layout: Layout, names: list[str], reported: list[str]) -> list[Group]:
+def _without_other_targets(config: Mapping[str, Any], protocol: str) -> Mapping[str, Any]:
+    """A configuration without the values of targets, if they are not those of the measured protocol."""
+    targets = config.get("targets")
+    if not isinstance(targets, Mapping) or targets.get("name") == protocol:
+        return config
+    return {**config, "targets": {key: targets.get(key) for key in OF_TRAINING_TARGETS}}
+
+
+def _make_groups(layout: Layout, names: Sequence[str], reported: list[str]) -> list[Group]:
     """Groups of columns, given the names of the measured data sets and the titles of reported ones."""
     if layout.columns == "data":
         titles = dict.fromkeys([*reported, *map(data_title, names)])
         text = "{}, {}-view" if len(layout.views) > 1 else "{}"
-        return [Group(text.format(name, n), n, name) for name, n in itertools.product(titles, layout.views)]
+        return [Group(text.format(name, n), n, name) for name, n in product(titles, layout.views)]
     is_alone = len(LAYOUTS[layout.name].views) == 1
     return [Group(data_title(names[0]) if is_alone else f"{n}-view", n) for n in layout.views]
 
@@ -189,15 +175,15 @@ def _name_ablations(reported: list[Variant], measured: list[Variant]) -> tuple[t
 
 
 def _name_methods(reported: list[Variant], measured: list[Variant]) -> tuple[tuple[str, ...], list[Line]]:
-    """Heading and rows of reported methods, baselines, other methods and our models, which are named by
-    their differences."""
+    """Heading and rows of reported methods, baselines and our models, which are named by their
+    differences."""
     names = {variant: f"† {variant.name}" for variant in reported}
     names |= {variant: BASELINES.get(variant.name, variant.name) for variant in measured}
     models = [variant for variant in measured if variant.kind == "model"]
-    parts = [[v.model, v.encoder, v.ablation, *v.titles] for v in models]
+    parts = [[v.model, v.encoder, v.ablation, *v.extra] for v in models]
     differs = [len(set(values)) > 1 for values in zip(*parts, strict=True)]
     for variant, values in zip(models, parts, strict=True):
-        titles = [value for value in itertools.compress(values, differs) if value not in PEERS]
+        titles = [value for value in compress(values, differs) if value not in PEERS]
         details = f" ({', '.join(titles)})" if titles else ""
         names[variant] = PEERS.get(variant.model, "Ours") + details
     return ("Methods",), [Line(variant, (name,)) for variant, name in names.items()]

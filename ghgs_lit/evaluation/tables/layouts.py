@@ -1,4 +1,4 @@
-"""Layouts of tables (the paper's four, and the ablation at several numbers of views) and their parts."""
+"""Layouts of tables (the paper's four, and the ablation at several numbers of views), and printed forms."""
 
 import re
 from collections.abc import Mapping
@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from ghgs_lit.evaluation.tables.runs import Planned
-from ghgs_lit.evaluation.tables.variants import Variant
+from ghgs_lit.evaluation.tables.runs import Variant
 from ghgs_lit.parsing import read_yaml
 
 
@@ -75,6 +74,10 @@ LAYOUTS = {
 }
 
 
+CELL = ["line", "group", "metric"]
+"""Index of a cell: numbers of the line and of the group of columns, and the metric."""
+
+
 class Group(NamedTuple):
     """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views`` input
     views."""
@@ -91,10 +94,6 @@ class Line(NamedTuple):
     stub: tuple[str, ...]
 
 
-CELL = ["line", "group", "metric"]
-"""Index of a cell: numbers of the line and of the group of columns, and the metric."""
-
-
 @dataclass
 class Table:
     """A table, with everything that writers of all formats need.
@@ -102,34 +101,32 @@ class Table:
     Attributes:
         layout: Rows and columns.
         rows: Measurements, as in :class:`ghgs_lit.evaluation.tables.runs.Sweep`.
-        planned: Training runs of the table that have no results yet.
+        planned: Rows of training runs that have no results yet.
         configs: Configuration of our model by ``source``.
-        stub: Headings of the columns that name a row.
-        groups: Groups of columns.
-        metrics: Names of the metrics of each group.
-        lines: Rows of the table.
         left_out: Number of runs that are not in the table.
-        unit: Regular expression whose first group is the person, if subjects are frames of people.
-        reported_on: Data of the reported figures, if any.
+        metrics: Names of the metrics of each group.
+        reported_on: Titles of the data of the reported figures, if any.
+        groups: Groups of columns.
+        stub: Headings of the columns that name a row.
+        lines: Rows of the table.
         cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over
             seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples,
-            ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed),
-            ``test`` (a :class:`ghgs_lit.evaluation.tables.significance.Comparison` or None),
-            ``marked`` (significant).
+            ``count`` of subjects, ``runs`` (hashes), ``best`` (of its column, as printed), ``marked``
+            (significant), and the :class:`ghgs_lit.evaluation.tables.significance.Comparison` with
+            the column's reference, prefixed with ``test_``.
         comparisons: Number of comparisons that are corrected together.
     """
 
     layout: Layout
     rows: pd.DataFrame
-    planned: list[Planned]
+    planned: pd.DataFrame
     configs: Mapping[str, Mapping[str, Any]]
-    stub: tuple[str, ...]
-    groups: list[Group]
-    metrics: list[str]
-    lines: list[Line]
     left_out: int
-    unit: re.Pattern[str] | None = None
-    reported_on: str | None = None
+    metrics: list[str]
+    reported_on: list[str]
+    groups: list[Group]
+    stub: tuple[str, ...]
+    lines: list[Line]
     cells: pd.DataFrame = field(default_factory=pd.DataFrame)
     comparisons: int = 0
 

@@ -1,27 +1,21 @@
-"""Runs and results of other methods as frames: row of the table, setting, and metrics of each subject.
+"""Runs below folders as one frame: row of the table, setting, and metrics of each subject.
 
 A run is identified by its configuration, never by the name of its directory.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any
 
 import pandas as pd
-from pydantic import AliasPath, BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import AliasPath, BaseModel, ConfigDict, Field
 
-from ghgs_lit.config.keys import flatten, is_below, lookup
+from ghgs_lit.config import conf_dir
+from ghgs_lit.config.keys import ablation_of, flatten, is_below, is_custom_ablation, lookup, switches_of
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.evaluation.tables.variants import (
-    TRAINING_COUNTS,
-    Variant,
-    find_keys_of_rows,
-    find_views_of_columns,
-    model_variant,
-)
-from ghgs_lit.parsing import read_json, read_yaml
+from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.results import METHOD, read_results, validate
 from ghgs_lit.runs.run import runs_in_order
 
@@ -30,18 +24,50 @@ SETTING = ["data", "split", "targets", "protocol"]
 TRAINING = {"steps": ("steps", 1), "seconds": ("seconds", 1), "peak_gb": ("peak_bytes", 1e9)}
 """Metrics of the training, which are not per subject: key in the provenance, and divisor to the
 printed unit."""
+TRAINING_COUNTS = "views.training_counts"
+OF_TRAINING_TARGETS = ("training_views", "per_step")
+"""Keys of ``targets`` that affect training."""
+#: Keys that identify an encoder of conf/encoder; models change its other keys.
+_ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
 
 
-class Planned(NamedTuple):
-    """A training run without results: its row, data set, numbers of input views and seed."""
+@dataclass(frozen=True)
+class Variant:
+    """Identity of a row of a table.
 
-    variant: Variant
-    data: str
-    views: tuple[int, ...]
-    seed: int
+    Attributes:
+        kind: ``model`` (ours), ``baseline`` or ``reported`` (by the paper).
+        name: Name of the method.
+        model: Name of the model, with its differences from the shipped one; empty for other methods.
+        encoder: Name of its encoder; empty for other methods.
+        ablation: The chosen option; empty for other methods.
+        switches: Whether its 3D unprojection and semantic consistency are on.
+        extra: Further configuration keys that distinguish rows, such as ``optimizer.lr=0.1``.
+        has_semantics: Whether the semantic features were trained (published weights or `ghgs
+            pretext`); unknown before training starts, so it does not distinguish rows.
+    """
+
+    kind: str
+    name: str
+    model: str = ""
+    encoder: str = ""
+    ablation: str = ""
+    switches: tuple[bool, bool] | None = None
+    extra: tuple[str, ...] = ()
+    has_semantics: bool = field(default=True, compare=False)
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this is a row of a user-defined ablation."""
+        return bool(self.ablation) and is_custom_ablation(self.ablation)
+
+    @property
+    def trained(self) -> str:
+        """Identity of the model without its ablation."""
+        return " ".join((self.model, self.encoder, *self.extra))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Sweep:
     """All runs below the directories of a sweep.
 
@@ -50,13 +76,12 @@ class Sweep:
             ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the
             configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over the
             subject's targets; and ``trained_views``, the number of views in training of models that
-            share a row and were each trained with a different one.
-        planned: Training runs without results.
+            share a row and were each trained with a different one. Of a training without results: one
+            row for each number of views, without subject and metrics.
         configs: Configuration of our model by ``source``.
     """
 
     rows: pd.DataFrame
-    planned: list[Planned]
     configs: dict[str, Mapping[str, Any]]
 
 
@@ -79,8 +104,7 @@ class _Provenance(BaseModel):
 
 
 def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as trained
-    and measured."""
+    """Rows of a ``metrics.json``, and the configuration of its model as trained and measured."""
     content = read_results(path)
     source = validate(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
@@ -88,7 +112,7 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     config = trained | {key: source.config[key] for key in of_evaluation if key in source.config}
     measured = source.config.get("targets")
     if isinstance(measured, Mapping) and isinstance(trained.get("targets"), Mapping):
-        of_training = {key: trained["targets"].get(key) for key in ("training_views", "per_step")}
+        of_training = {key: trained["targets"].get(key) for key in OF_TRAINING_TARGETS}
         config["targets"] = {**measured, **of_training}
     seed = trained.get("seed", source.seed)
     require(isinstance(seed, int), f"{path}: provenance.seed", "a whole number", seed)
@@ -107,8 +131,9 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     return rows.assign(**about), config
 
 
-def _read_training(path: Path) -> dict[str, Any] | None:
-    """The ``config.yaml`` of a training run; None: it belongs to another command or is incomplete."""
+def _read_training(path: Path) -> tuple[pd.DataFrame, dict[str, Any]] | None:
+    """Rows without results of a training's ``config.yaml``, and its configuration; None: it belongs to
+    another command or is incomplete."""
     try:
         config = read_yaml(path)
     except InputError:
@@ -116,8 +141,11 @@ def _read_training(path: Path) -> dict[str, Any] | None:
     needed = ("trainer", "data", "recalibration")
     if not isinstance(config, Mapping) or not all(key in config for key in needed):
         return None
-    require(isinstance(config.get("seed", 0), int), f"{path}: seed", "a whole number", config.get("seed"))
-    return config
+    seed = config.get("seed", 0)
+    require(isinstance(seed, int), f"{path}: seed", "a whole number", seed)
+    rows = pd.DataFrame({"views": lookup(config, "evaluation.views") or []})
+    data = str(lookup(config, "data.name"))
+    return rows.assign(method=METHOD, seed=seed, source=str(path), data=data, subject=None), config
 
 
 def _find_runs(folders: Sequence[Path]) -> list[Path]:
@@ -146,109 +174,139 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
 
     Args:
         folders: Directories of sweeps or runs.
-        by: Configuration keys that distinguish rows beyond model, encoder, ablation and the views and
-            targets of the training.
+        by: Configuration keys that distinguish rows beyond model, encoder and ablation.
 
     Raises:
         FileNotFoundError: A folder is missing.
         InputError: There is no finished run, a ``metrics.json`` is damaged, or no run has a key of
             ``by``.
     """
-    results: dict[str, pd.DataFrame] = {}
-    models: dict[str, Mapping[str, Any]] = {}
-    begun: dict[str, Mapping[str, Any]] = {}
-    known: set[str] = set()
+    frames: dict[str, pd.DataFrame] = {}
+    configs: dict[str, Mapping[str, Any]] = {}
     for path in _find_runs(folders):
-        if path.name == "metrics.json":
-            results[str(path)], config = _read_run(path)
-            known |= flatten(config).keys()
-            if METHOD in set(results[str(path)]["method"]):
-                models[str(path)] = config
-        elif config := _read_training(path):
-            begun[str(path)] = config
-    if not results:
+        is_measured = path.name == "metrics.json"
+        run = _read_run(path) if is_measured else _read_training(path)
+        if run is not None:
+            frames[str(path)], configs[str(path)] = run
+    if not any(path.endswith("metrics.json") for path in frames):
         names = ", ".join(map(str, folders))
-        found = f"{len(begun)} runs without one" if begun else "none"
+        found = f"{len(frames)} runs without one" if frames else "none"
         raise InputError(f"{names}: expected runs with a metrics.json below it; found {found}")
+    known = set().union(*map(flatten, configs.values()))
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
-    configs = {**models, **begun}
+    configs = {path: config for path, config in configs.items() if METHOD in set(frames[path]["method"])}
     views = {} if TRAINING_COUNTS in by else find_views_of_columns(configs)
-    for path in views:  # one row, whatever the number of views in training
-        configs[path] = {**configs[path], "views": {**configs[path]["views"], "training_counts": "as many"}}
-    by = list(dict.fromkeys([*by, *find_keys_of_rows(configs.values())]))
-    variants = {path: model_variant(config, path, by) for path, config in configs.items()}
-    frames = []
-    for path, rows in results.items():
+    for path, rows in frames.items():
+        variants = {name: Variant("baseline", name) for name in rows["method"]}
+        if path in configs:
+            variants[METHOD] = model_variant(configs[path], path, by)
         if path in views:
             rows = rows[(rows["method"] != METHOD) | (rows["views"] == views[path])]
-        variant = [variants[path] if name == METHOD else Variant("baseline", name) for name in rows["method"]]
         trained_views = float(views.get(path, "nan"))
-        frames.append(rows.drop(columns="method").assign(variant=variant, trained_views=trained_views))
-    planned = []
-    for path, config in begun.items():
-        counts = views.get(path, lookup(config, "evaluation.views"))
-        counts = (counts,) if isinstance(counts, int) else tuple(counts or ())
-        data = str(lookup(config, "data.name"))
-        planned.append(Planned(variants[path], data, counts, config.get("seed", 0)))
-    return Sweep(pd.concat(frames, ignore_index=True), planned, models)
+        variant = [variants[name] for name in rows["method"]]
+        frames[path] = rows.drop(columns="method").assign(variant=variant, trained_views=trained_views)
+    return Sweep(pd.concat(frames.values(), ignore_index=True), configs)
 
 
-_Text = Annotated[str, Field(min_length=1)]
-_Count = Annotated[int, Field(ge=1)]
+def find_views_of_columns(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """Number of views in training, by file, of models that fill one column each.
+
+    These are models on the same data that were each trained with a single number of views, if these
+    numbers differ.
+    """
+    counts: dict[str, dict[str, int]] = {}
+    for path, config in configs.items():
+        trained = lookup(config, TRAINING_COUNTS)
+        if isinstance(trained, list | tuple) and len(trained) == 1:
+            counts.setdefault(str(lookup(config, "data.name")), {})[path] = trained[0]
+    views: dict[str, int] = {}
+    for of_data in counts.values():
+        if len(set(of_data.values())) > 1:
+            views |= of_data
+    return views
 
 
-class _Row(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
-    data: _Text
-    split: _Text
-    targets: _Text
-    protocol: _Text
-    views: _Count
-    seed: int = 0
-    subject: _Text | None = None
-    subjects: _Count | None = None
-    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
+@cache
+def _read_shipped(group: str) -> dict[str, dict]:
+    return {path.stem: read_yaml(path) for path in sorted((conf_dir() / group).glob("*.yaml"))}
 
 
-class _Others(BaseModel):
-    """A results file of another method, in the format that ``docs/tables.md`` describes."""
-
-    model_config = ConfigDict(strict=True, extra="forbid")
-    format: Literal["ghgs_lit.others"]
-    format_version: Literal[1]
-    method: _Text
-    source: _Text
-    rows: Annotated[list[_Row], Field(min_length=1)]
-
-
-def read_others(path: Path) -> pd.DataFrame:
-    """Read the results file of another method.
+def encoder_name(config: Mapping[str, Any]) -> str:
+    """Name of the encoder in a configuration.
 
     Args:
-        path: JSON file in the format of ``docs/tables.md``.
+        config: Resolved configuration of a training.
 
     Returns:
-        Rows as in :class:`Sweep`. ``origin`` is the file's ``source``. Means have no ``subject``, and
-        optionally a ``count`` of subjects.
+        The option of conf/encoder with these sizes, or ``unnamed``, followed by ``, semantic branch``
+        if it has one.
+    """
+    branch = ", semantic branch" * (lookup(config, "encoder.semantic") is not None)
+    values = flatten({key: lookup(config, f"encoder.{key}") for key in _ENCODER_KEYS})
+    for name, shipped in _read_shipped("encoder").items():
+        # A file overrides single keys of nested mappings.
+        if flatten({key: shipped.get(key) for key in _ENCODER_KEYS}).items() <= values.items():
+            return name + branch
+    return "unnamed" + branch
+
+
+def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
+    """The table row of a model.
+
+    Args:
+        config: Configuration of the model as trained and measured.
+        source: File of the configuration, for messages.
+        by: Keys that distinguish rows beyond model, encoder and ablation.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        InputError: It does not have the format; the message names the key.
+        InputError: The configuration has no recalibration, whose parts the ablation switches.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
-    others = validate(_Others, read_json(path), path.name)
-    rows = pd.DataFrame([row.model_dump() for row in others.rows])
-    cell = [*SETTING, "views", "seed"]
-    repeated = rows.duplicated([*cell, "subject"])
-    if repeated.any():
-        at = f"{path.name}.rows[{repeated.idxmax()}]"
-        raise InputError(f"{at}: expected each subject once a setting; found one again")
-    means = rows["subject"].isna()
-    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
-        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
-    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
-    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
-    variant = Variant("other", others.method)
-    return rows.assign(variant=variant, source=str(path), run=None, origin=others.source).join(metrics)
+    recalibration = config.get("recalibration")
+    require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
+    # A user-defined option of conf/model can have the name of the one that it is based on.
+    model = lookup(config, "chosen.model")
+    if model is None or model in _read_shipped("model"):
+        model = str(lookup(config, "model.name") or "unnamed")
+    compat = lookup(config, "compat.name")
+    model += f", compat {compat}" * (compat not in (None, "none"))
+    return Variant(
+        "model",
+        "ours",
+        model,
+        encoder_name(config),
+        ablation_of(config),
+        switches_of(config),
+        tuple(f"{key}={lookup(config, key)}" for key in by),
+        # Without such weights the encoder was trained by the rendering loss only.
+        has_semantics=bool(lookup(config, "encoder.weights")),
+    )
+
+
+ABSENT = "absent"
+"""Text for a key that a configuration does not have."""
+
+
+def find_differences(configs: Sequence[Mapping[str, Any]], expected: Iterable[str]) -> dict[str, list[str]]:
+    """Find the dotted keys in which configurations differ.
+
+    Args:
+        configs: Configurations of several runs.
+        expected: Keys that may differ, with those below them.
+
+    Returns:
+        Different values of each key as text, ``ABSENT`` where a configuration does not have it.
+    """
+    flat = [flatten(config) for config in configs]
+    texts = {}
+    for key in dict.fromkeys(key for values in flat for key in values):
+        values = list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat))
+        if len(values) > 1 and not is_below(key, expected):
+            texts[key] = values
+    return texts
+
+
+def describe(keys: Mapping[str, Sequence[str]]) -> str:
+    """The first keys and values of :func:`find_differences`, such as ``optimizer.lr (0.001, 0.0001)``."""
+    shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:6]]
+    return ", ".join(shown) + (f" and {len(keys) - 6} more" if len(keys) > 6 else "")

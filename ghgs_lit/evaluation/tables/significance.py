@@ -10,7 +10,6 @@ are added (min F', Clark 1973), with the degrees of freedom of the smaller sampl
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,37 +25,30 @@ RATIO = 2.0
 """Ratio of the deviations of rows over seeds up to which the level holds."""
 
 
-@dataclass(frozen=True)
-class Comparison:
+class Comparison(NamedTuple):
     """Comparison of a row with the reference row of its column, on the seeds and subjects of both.
 
-    With fewer than two seeds or subjects, the interval, the p-values and all values derived from them
-    are None.
+    With fewer than two seeds or subjects, the interval and the p-value are nan.
 
     Attributes:
         seeds: Number of seeds.
         subjects: Number of subjects.
-        difference: Mean of row minus reference; None without pairs.
+        difference: Mean of row minus reference; nan without pairs.
         low: Lower end of its interval at level 1 - ``ALPHA``, not corrected.
         high: Upper end of that interval.
-        p: Two-sided p-value.
-        corrected: p-value after Holm's correction.
+        p: Two-sided p-value, not corrected.
         error: Standard error of the difference.
         freedom: Degrees of freedom of the error.
-        smallest: The difference that is detected with a probability of ``POWER`` among all
-            comparisons of the table.
     """
 
     seeds: int
     subjects: int
-    difference: float | None = None
-    low: float | None = None
-    high: float | None = None
-    p: float | None = None
-    corrected: float | None = None
-    error: float | None = None
-    freedom: int | None = None
-    smallest: float | None = None
+    difference: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    p: float = math.nan
+    error: float = math.nan
+    freedom: int = 0
 
 
 class Pool(NamedTuple):
@@ -85,19 +77,16 @@ def pool(rows: Sequence[pd.DataFrame]) -> Pool:
         The variance; its degrees of freedom are 0 if it cannot be estimated.
     """
     means = [row.dropna(axis="columns").mean(axis="columns") for row in rows]
-    table = pd.concat(means, axis="columns").to_numpy()
-    table = table[(~np.isnan(table)).sum(axis=1) > 1]
-    known = ~np.isnan(table)
-    seed, row = np.nonzero(known)
-    if not len(seed):
+    table = pd.concat(means, axis="columns", keys=range(len(rows)))
+    cells = table[table.count(axis="columns") > 1].stack().dropna()
+    if cells.empty:
         return Pool(0.0, 0, 0)
-    # Partial out the effects of seeds from values and row indicators (Frisch-Waugh-Lovell).
-    values = (table - np.nanmean(table, axis=1, keepdims=True))[seed, row]
-    indicators = np.eye(len(rows))[row] - (known / known.sum(axis=1, keepdims=True))[seed]
-    effects, _, rank, _ = np.linalg.lstsq(indicators, values)
-    residuals = values - indicators @ effects
-    freedom = len(values) - len(table) - int(rank)
-    return Pool(float(residuals @ residuals) / max(freedom, 1), freedom, len(set(row)))
+    seed, row = (pd.get_dummies(cells.index.get_level_values(level)) for level in (0, 1))
+    effects = np.hstack([seed, row]).astype(float)
+    solution, _, rank, _ = np.linalg.lstsq(effects, cells)
+    residuals = cells - effects @ solution
+    freedom = len(cells) - int(rank)
+    return Pool(float(residuals @ residuals) / max(freedom, 1), freedom, row.shape[1])
 
 
 def compare(row: pd.DataFrame, reference: pd.DataFrame, pooled: Pool | None = None) -> Comparison:
@@ -126,7 +115,7 @@ def compare(row: pd.DataFrame, reference: pd.DataFrame, pooled: Pool | None = No
     errors = abs(mean) / error if error > 0 else math.inf if mean else 0.0
     p = float(2 * stats.t.sf(errors, freedom))
     half = float(stats.t.isf(ALPHA / 2, freedom)) * error
-    return Comparison(seeds, subjects, mean, mean - half, mean + half, p, error=error, freedom=freedom)
+    return Comparison(seeds, subjects, mean, mean - half, mean + half, p, error, freedom)
 
 
 def smallest_difference(comparison: Comparison, comparisons: int) -> float:
@@ -138,23 +127,25 @@ def smallest_difference(comparison: Comparison, comparisons: int) -> float:
         comparisons: Number of comparisons, at least 1.
 
     Returns:
-        The difference, in the unit of the metric.
+        The difference, in the unit of the metric; nan without a standard error.
     """
     freedom = comparison.freedom
+    if not freedom:
+        return math.nan
     needed = stats.t.isf(ALPHA / 2 / comparisons, freedom)
     errors = brentq(lambda errors: stats.nct.sf(needed, freedom, errors) - POWER, 0, 2 * needed + 10)
     return float(comparison.error * errors)
 
 
-def holm(values: Sequence[float]) -> list[float]:
+def holm(values: Sequence[float]) -> pd.Series:
     """Holm's correction of p-values (Holm 1979).
 
     Args:
-        values: p-values of all comparisons of a table.
+        values: p-values of all comparisons of a table; nan: none.
 
     Returns:
-        Corrected p-values in the same order, at most 1.
+        Corrected p-values in the same order, at most 1; nan stays nan.
     """
     ordered = pd.Series(values, dtype=float).sort_values(kind="stable")
-    scaled = ordered * np.arange(len(ordered), 0, -1)
-    return scaled.cummax().clip(upper=1).sort_index().tolist()
+    scaled = ordered * np.arange(ordered.count(), ordered.count() - len(ordered), -1)
+    return scaled.cummax().clip(upper=1).sort_index()

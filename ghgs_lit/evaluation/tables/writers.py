@@ -5,15 +5,15 @@ LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
 from tabulate import tabulate
 
+from ghgs_lit.config.keys import EXPECTED_TO_DIFFER
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, metric_of, paper
+from ghgs_lit.evaluation.tables.runs import TRAINING_COUNTS, describe, find_differences
 from ghgs_lit.evaluation.tables.significance import ALPHA, POWER
-from ghgs_lit.evaluation.tables.variants import describe, find_differences
 
 MARK = r"\*"
 """Mark of a significant difference, in Markdown."""
@@ -22,7 +22,6 @@ _TRAINED_VIEWS = (
     "Each column shows the model that was trained with as many input views;"
     " `by=[views.training_counts]` gives each model a row."
 )
-_MEANS = "Rows of other methods without subjects are not tested and are means of all their subjects."
 _NEIGHBORS = (
     "**The switch of 3D unprojection hardly switches**: most neighbours of a token are the same with and"
     " without it (`columns=[shared_neighbors]`), because recalibration.k is close to the number of tokens:"
@@ -57,7 +56,7 @@ def write_caption(table: Table) -> str:
         f"metrics `{first['protocol']}`",
     ]
     if table.is_ablation:
-        parts += [f"model `{variant.model}`", f"encoder `{variant.encoder}`", *variant.titles]
+        parts += [f"model `{variant.model}`", f"encoder `{variant.encoder}`", *variant.extra]
     views = ", ".join(str(count) for count in dict.fromkeys(group.views for group in table.groups))
     parts.append(f"{views} input views")
     spread = lead = ""
@@ -69,20 +68,17 @@ def write_caption(table: Table) -> str:
 
 
 def _format_range(values: pd.Series) -> str:
-    return " to ".join(map(str, dict.fromkeys((values.min(), values.max()))))
+    return " to ".join(f"{value:.0f}" for value in dict.fromkeys((values.min(), values.max())))
 
 
 def write_notes(table: Table) -> list[str]:
     """Notes below a table that affect its interpretation, as paragraphs of Markdown."""
-    kinds = table.rows["variant"].map(lambda variant: variant.kind)
-    ours = table.rows[kinds == "model"]
-    others = table.rows[kinds == "other"]
+    ours = table.rows[[variant.kind == "model" for variant in table.rows["variant"]]]
     by_row = ours.groupby("variant", sort=False)
     shared = by_row["shared_neighbors"].mean().max() if "shared_neighbors" in ours else 0
     applies = {
         _NO_SEMANTICS: table.is_ablation and not ours["variant"].iloc[0].has_semantics,
         _TRAINED_VIEWS: len(table.groups) > 1 and table.rows["trained_views"].nunique() > 1,
-        _MEANS: others["subject"].isna().any(),
         _NEIGHBORS: table.is_ablation and shared > _MOSTLY_SHARED,
         _STEPS: "steps" in ours and ours["steps"].nunique() > 1,
         _SEEDS: by_row["seed"].agg(lambda seeds: tuple(sorted(set(seeds)))).nunique() > 1,
@@ -91,17 +87,16 @@ def write_notes(table: Table) -> list[str]:
     notes = [note for note, holds in applies.items() if holds]
     if table.reported_on:
         notes.append(
-            f"† Reported: figures that {paper()['source']}, prints for {table.reported_on}, measured by its"
-            " authors. They are not comparable with figures on other data, splits, views or protocols."
+            f"† Reported: figures that {paper()['source']}, prints for {' and '.join(table.reported_on)},"
+            " measured by its authors. They are not comparable with figures on other data, splits, views or"
+            " protocols."
         )
-    notes += dict.fromkeys(f"{row.variant.name}: {row.origin}." for row in others.itertuples())
     if table.left_out:
-        notes.append(f"Further runs in the folder, of other data, views or ablations: {table.left_out}.")
-    planned = [
-        f"{data_title(p.data)} {p.variant.model} {p.variant.ablation} seed {p.seed}" for p in table.planned
-    ]
+        notes.append(f"Runs of the folder that are not in the table: {table.left_out}.")
+    planned = table.planned.groupby(["data", "variant", "seed"], sort=False).groups
     if planned:
-        notes.append(f"No results yet (in progress or cut off): {'; '.join(dict.fromkeys(planned))}.")
+        names = [f"{data_title(data)} {row.model} {row.ablation} seed {seed}" for data, row, seed in planned]
+        notes.append(f"No results yet (in progress or cut off): {'; '.join(names)}.")
     notes += _describe_test(table)
     if keys := _find_differences(table, ours):
         notes.append(f"Runs side by side differ also in {describe(keys)}.")
@@ -113,35 +108,36 @@ def write_notes(table: Table) -> list[str]:
 
 def _find_differences(table: Table, ours: pd.DataFrame) -> dict[str, list[str]]:
     """Keys in which runs of a row, or of all rows of ablations, differ, except for those in row names."""
-    shown = {"checkpoint"}
+    expected = {*EXPECTED_TO_DIFFER, "checkpoint"}
+    if ours["trained_views"].notna().any():
+        expected.add(TRAINING_COUNTS)
     groups: dict[tuple, list] = {}
     for source, rows in ours.groupby("source", sort=False):
         variant = rows["variant"].iloc[0]
-        shown.update(key for key, _ in variant.extra)
+        expected.update(text.partition("=")[0] for text in variant.extra)
         row = (variant.model, variant.encoder, variant.ablation, rows["data"].iloc[0])
         groups.setdefault(() if table.is_ablation else row, []).append(table.configs[source])
     keys = {}
     for group in groups.values():
-        keys |= find_differences(group)
-    return {key: values for key, values in keys.items() if key not in shown}
+        keys |= find_differences(group, expected)
+    return keys
 
 
 def _describe_test(table: Table) -> list[str]:
     """Meaning of the marks, and the smallest difference that the seeds and subjects could show."""
-    tests = table.cells["test"].dropna()
-    known = [test for test in tests if test.p is not None]
-    if not known:
-        lack = "subjects" if any(test.seeds > 1 for test in tests) else "seeds"
+    tests = table.cells[table.cells["test_seeds"].notna()]
+    known = tests[tests["test_p"].notna()]
+    if known.empty:
+        lack = "subjects" if (tests["test_seeds"] > 1).any() else "seeds"
         return [f"No differences are marked: rows have fewer than two {lack} in common."] * (len(tests) > 0)
     models = [line.variant.ablation for line in table.lines if line.variant.kind == "model"]
     against = "the row of the whole method" if models.count("full") == 1 else "its column's best row"
-    counts = pd.DataFrame(known)
-    metric = metric_of(tests.index[0][2])
+    metric = metric_of(known.index[0][2])
     return [
         f"{MARK} {metric.title} differs beyond chance from {against} (p < {ALPHA:g} after Holm's"
-        f" correction over {table.comparisons} comparisons of {_format_range(counts['seeds'])} seeds and"
-        f" {_format_range(counts['subjects'])} subjects). In brackets the {1 - ALPHA:.0%} interval of the"
-        f" difference. A difference of {counts['smallest'].max():.{metric.decimals}f} is found with"
+        f" correction over {table.comparisons} comparisons of {_format_range(known['test_seeds'])} seeds and"
+        f" {_format_range(known['test_subjects'])} subjects). In brackets the {1 - ALPHA:.0%} interval of the"
+        f" difference. A difference of {known['test_smallest'].max():.{metric.decimals}f} is found with"
         f" {POWER:.0%} power."
     ]
 
@@ -158,8 +154,8 @@ def _format_cell(cell: Any) -> str:
         text += f" ± {cell.deviation:.{digits}f}"
     if cell.marked:
         text += MARK
-    if cell.test is not None and cell.test.low is not None:
-        ends = [f"{end:+z.{digits}f}" for end in (cell.test.low, cell.test.high)]
+    if pd.notna(cell.test_low):
+        ends = [f"{end:+z.{digits}f}" for end in (cell.test_low, cell.test_high)]
         text += f" [{', '.join(ends)}]" if any(map(float, ends)) else ""  # no interval for equal rows
     if cell.lacking:
         text += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
@@ -192,51 +188,45 @@ def to_markdown(table: Table) -> str:
 def to_csv(tables: Sequence[Table]) -> str:
     """Write all cells with all digits, a line each, by ``COLUMNS``; the mean is empty if a run is
     missing."""
-    lines = []
+    frames = []
     for number, table in enumerate(tables, 1):
-        for cell in table.cells.itertuples():
-            lines.append({"table": number, **_describe_row(table, cell), **_figures(cell)})
-    frame = pd.DataFrame(lines, columns=COLUMNS)
+        cells = table.cells.rename(columns={"count": "subjects"})
+        cells["best"] = cells["best"].where(cells["mean"].notna())
+        cells["seeds_lacking"] = cells["lacking"].map(_join)
+        cells["seeds"] = cells["seeds"].map(_join, na_action="ignore")
+        about = [_describe_row(table, *place) for place in cells.index]
+        frames.append(pd.DataFrame(about, cells.index).join(cells).assign(table=number))
+    frame = pd.concat(frames).reindex(columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
 
 
-def _describe_row(table: Table, cell: Any) -> dict[str, Any]:
+def _join(seeds: tuple[int, ...]) -> str:
+    return " ".join(map(str, sorted(seeds)))
+
+
+def _describe_row(table: Table, line: int, group: int, metric: str) -> dict[str, Any]:
     """Row, setting and metric of a cell, by column of the CSV file."""
-    variant, stub = table.lines[cell.Index[0]]
-    group = table.groups[cell.Index[1]]
-    # Splits, targets and protocols of our runs do not apply to the paper's figures.
-    setting = {"data": table.reported_on} if variant.kind == "reported" else table.rows.iloc[0]
+    variant, _ = table.lines[line]
+    _, views, data = table.groups[group]
+    first = table.rows.iloc[0]
     unprojection, semantic = variant.switches or (None, None)
-    return {
+    about = {
         "kind": variant.kind,
-        "method": "ours" if table.is_ablation else variant.name if variant.kind == "reported" else stub[0],
+        "method": variant.name,
         "model": variant.model,
         "encoder": variant.encoder,
         "ablation": variant.ablation,
         "unprojection": unprojection,
         "semantic": semantic,
-        "extra": " ".join(f"{key}={value}" for key, value in variant.extra),
-        "data": group.data or data_title(setting["data"]),
-        **{name: setting.get(name) for name in ("split", "targets", "protocol")},
-        "views": group.views,
-        "metric": cell.Index[2],
+        "extra": " ".join(variant.extra),
+        "views": views,
+        "metric": metric,
     }
-
-
-def _figures(cell: Any) -> dict[str, Any]:
-    """Figures of a cell, by column of the CSV file; empty without a number."""
-    if pd.isna(cell.mean):
-        return {}
-    figures = {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
-    if isinstance(cell.seeds, tuple):  # measured, not reported
-        figures["seeds"] = " ".join(map(str, sorted(cell.seeds)))
-        figures["seeds_lacking"] = " ".join(map(str, cell.lacking))
-        figures |= {"subjects": cell.count, "runs": cell.runs}
-    if cell.test is not None:
-        figures |= {f"test_{name}": value for name, value in asdict(cell.test).items()}
-        figures["test_p_holm"] = cell.test.corrected
-    return figures
+    if variant.kind == "reported":  # our split, targets and protocol do not apply to the paper's figures
+        return {**about, "data": data or table.reported_on[0]}
+    setting = {name: first[name] for name in ("split", "targets", "protocol")}
+    return {**about, **setting, "data": data or data_title(first["data"])}
 
 
 PREAMBLE = r"""% \usepackage{booktabs,multirow,adjustbox,pifont}

@@ -13,34 +13,19 @@ import pytest
 
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables import (
-    PREAMBLE,
-    read_others,
-    read_sweep,
-    to_csv,
-    to_latex,
-    to_markdown,
-)
-from ghgs_lit.evaluation.tables.variants import encoder_name
+from ghgs_lit.evaluation.tables import PREAMBLE, read_sweep, to_csv, to_latex, to_markdown
+from ghgs_lit.evaluation.tables.runs import encoder_name
 from ghgs_lit.evaluation.tables.writers import markdown_to_latex
 from ghgs_lit.runs.results import config_hash, read_results, summarize, write_results
-from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, other, views
+from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, views
 from tests.helpers.tables import tables_of, write_run
 
 EXPECTED = Path(__file__).parents[2] / "fixtures" / "tables"
-EXAMPLE = Path(__file__).parents[3] / "docs" / "example_others.json"
 WRITERS = {
     ".md": lambda tables: "\n".join(map(to_markdown, tables)),
     ".tex": lambda tables: "\n".join(to_latex(table, "table:x") for table in tables),
     ".csv": to_csv,
 }
-
-
-def others_file(folder: Path, rows: list, **changes) -> Path:
-    content = {"format": "ghgs_lit.others", "format_version": 1, "method": "GHG", "source": "their code"}
-    path = folder / "others.json"
-    path.write_text(json.dumps({**content, "rows": rows, **changes}))
-    return path
 
 
 def built(runs: str, options: dict, folder: Path) -> list:
@@ -51,8 +36,7 @@ def built(runs: str, options: dict, folder: Path) -> list:
     for name, text in (("half", "ablation: {name: ["), ("foreign", "a: 1")):
         (folder / "runs" / name).mkdir()
         (folder / "runs" / name / "config.yaml").write_text(text)
-    others = [read_others(others_file(folder, options["others"]))] if "others" in options else []
-    return tables_of(folder / "runs", **{**options, "others": others})
+    return tables_of(folder / "runs", **options)
 
 
 def written(case: str, suffix: str, folder: Path) -> str:
@@ -120,20 +104,28 @@ def test_rows_stand_in_the_order_of_the_command(tmp_path):
     ],
 )
 @pytest.mark.parametrize("seeds", [(1, 2), (1, 1)])
-@pytest.mark.parametrize("is_training", [True, False])
-def test_other_views_and_targets_are_other_rows(tmp_path, key, values, seeds, is_training):
-    """They change the model, or its protocol, as much as another learning rate does."""
+@pytest.mark.parametrize("protocols", [None, ("release", "release"), ("release", "midway")])
+def test_other_views_and_targets_share_no_row(tmp_path, key, values, seeds, protocols):
+    """They change the model, or its protocol, as much as another learning rate does; values of a protocol
+    that a run selected but that the table does not show are ignored."""
     group, _, name = key.partition(".")
     for number, value in enumerate(values):
         nodes = {"views": views(4), "targets": {"name": "release", "training_views": [2], "per_step": 3}}
         nodes["targets"] |= {"view": 3, "per_subject": 1}
         nodes[group][name] = value
-        measured = None if is_training else {"targets": nodes["targets"]}
+        measured = protocols and {"targets": nodes["targets"] | {"name": protocols[number]}}
         of = {f"of_{group}": node for group, node in nodes.items()}
-        write_run(tmp_path / str(number), "full", 20.0 + number, seeds[number], measured=measured, **of)
-    (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
-    assert [line.stub for line in table.lines] == [(f"Ours ({key}={value})",) for value in values]
-    assert list(table.cells["mean"][:, 0, "psnr"]) == [23.0, 24.0]
+        is_same = protocols == ("release", "midway") and name in ("view", "per_subject")
+        psnr = 20.0 if is_same else 20.0 + number
+        write_run(tmp_path / str(number), "full", psnr, seeds[number], measured=measured, **of)
+    options = {"layout": "table2", "reported": False, "metrics": ("psnr",)}
+    if not is_same:
+        with pytest.raises(InputError, match=rf"by=\[{key}\]"):
+            tables_of(tmp_path, **options)
+    (table,) = tables_of(tmp_path, by=[] if is_same else [key], **options)
+    names = [""] if is_same else [f" ({key}={value})" for value in values]
+    assert [line.stub for line in table.lines] == [(f"Ours{name}",) for name in names]
+    assert list(table.cells["mean"][:, 0, "psnr"]) == ([23.0] if is_same else [23.0, 24.0])
 
 
 @pytest.mark.parametrize(
@@ -142,8 +134,8 @@ def test_other_views_and_targets_are_other_rows(tmp_path, key, values, seeds, is
 def test_a_reference_that_its_figures_chose_counts_all_pairs(runs, layout, comparisons, tmp_path):
     (table,) = built(runs, {"layout": layout, "reported": False}, tmp_path)
     assert table.comparisons == comparisons
-    clearest = min(table.cells["test"].dropna(), key=lambda test: test.p)
-    assert clearest.corrected == pytest.approx(comparisons * clearest.p)
+    clearest = table.cells.sort_values("test_p").iloc[0]
+    assert clearest["test_p_holm"] == pytest.approx(comparisons * clearest["test_p"])
 
 
 def test_a_subject_counts_once_however_many_targets_it_has(tmp_path):
@@ -169,48 +161,6 @@ def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
 def test_encoders_of_the_package_have_their_names(name):
     """A file overrides single keys of the nested ``vit``."""
     assert encoder_name(run_of("train", [f"encoder={name}"]).plain) == name
-
-
-def test_the_example_of_the_documentation_is_read(tmp_path):
-    """The documented file is valid, with subjects and with means."""
-    rows = read_others(EXAMPLE)
-    assert rows.set_index("subject")["psnr"]["p1000001"] == 26.85
-    assert rows[rows["subject"].isna()][["views", "count"]].to_numpy().tolist() == [[5, 6]]
-
-
-@pytest.mark.parametrize(
-    ("rows", "changes", "message"),
-    [
-        ([other()], {"format": "x"}, r"others\.json\.format: expected .* 'ghgs_lit\.others'; found 'x'"),
-        ([other()], {"format_version": 2}, "format_version: expected to be 1; found 2"),
-        ([other()], {"methd": "x"}, r"others\.json\.methd: expected no such key"),
-        ([other()], {"source": ""}, "source: String should have at least 1 character; found ''"),
-        ([], {}, "rows: List should have at least 1 item"),
-        ([{**other(), "vews": 3}], {}, r"rows\[0\]\.vews: expected no such key"),
-        ([other(), {"data": "x"}], {}, r"rows\[1\]\.split: expected a value; found none"),
-        ([other(views="4")], {}, r"rows\[0\]\.views: expected to be a valid integer; found '4'"),
-        ([other(views=True)], {}, r"rows\[0\]\.views: expected to be a valid integer; found True"),
-        ([other(views=0)], {}, r"rows\[0\]\.views: expected to be greater than or equal to 1; found 0"),
-        ([other(psnr="25")], {}, r"metrics\.psnr: expected to be a valid number; found '25'"),
-        ([other(psnr=float("nan"))], {}, "expected to be a finite number; found nan"),
-        ([other(subject="a"), other(subject="a")], {}, r"rows\[1\]: .* found one again"),
-        ([other(), other()], {}, r"rows\[1\]: .* found one again"),
-        ([other(subject="a"), other()], {}, "expected subjects or one mean .* found both"),
-        ([other(subject="a", subjects=3)], {}, "found both"),
-        ([5], {}, r"rows\[0\]: expected to be a valid dictionary .* found 5"),
-    ],
-)
-def test_a_wrong_file_of_another_method_is_named_with_its_key(tmp_path, rows, changes, message):
-    with pytest.raises(InputError, match=message):
-        read_others(others_file(tmp_path, rows, **changes))
-
-
-def test_a_missing_or_damaged_file_of_another_method_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.json"):
-        read_others(tmp_path / "none.json")
-    (tmp_path / "bad.json").write_text("{")
-    with pytest.raises(InputError, match="expected JSON"):
-        read_others(tmp_path / "bad.json")
 
 
 @pytest.mark.parametrize(
