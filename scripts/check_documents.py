@@ -3,7 +3,6 @@
     python scripts/check_documents.py                          # everything that can run here
     python scripts/check_documents.py README.md docs/data.md   # some documents
     python scripts/check_documents.py --fast                   # fast commands and their prerequisites
-    python scripts/check_documents.py --list                   # list commands, and why some are excluded
 
 Commands are the lines of ``bash`` blocks, whole ``python`` blocks, and commands in running text. Each
 document gets an empty folder with links to parts of the checkout. Three tables in
@@ -212,14 +211,13 @@ class Reader:
         return process.returncode, time.monotonic() - start, output
 
 
-def check(document: str, folder: Path, fast: bool = False, listed: bool = False) -> Counter:
+def check(document: str, folder: Path, fast: bool = False) -> Counter:
     """Run the commands of one document and print a line for each.
 
     Args:
         document: relative to the repository.
         folder: parent of the document's folder.
         fast: only commands that end within seconds.
-        listed: only print the commands.
 
     Returns:
         Numbers of commands that ran, failed, and were not run.
@@ -228,7 +226,7 @@ def check(document: str, folder: Path, fast: bool = False, listed: bool = False)
     chosen = [c for c in commands(document) if not fast or (c.is_fast and c.reason is None)]
     reader = Reader(folder, document)
     needs_files = [c for c in chosen if c.reason is None and not re.search(r"--help|dry_run=true", c.text)]
-    if needs_files and not listed:
+    if needs_files:
         for text in BEFORE.get(document, ()):
             _run_one(reader, f"{document} (before)", text.splitlines()[0], text, False, [], count)
     for command in chosen:
@@ -237,8 +235,6 @@ def check(document: str, folder: Path, fast: bool = False, listed: bool = False)
         if command.reason is not None:
             count["not run"] += 1
             print(f"not run            {place}  {command.title}  ({command.reason})", flush=True)
-        elif listed:
-            print(f"run                {place}  {command.title}{_join(reasons)}")
         else:
             _run_one(reader, place, command.title, script, command.is_python, reasons, count)
     return count
@@ -267,7 +263,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--fast", action="store_true", help="only what ends within seconds, and what that needs"
     )
-    parser.add_argument("--list", action="store_true", help="print what would be run")
     parser.add_argument("--folder", type=Path, help="where commands are run; none: a temporary folder")
     given = parser.parse_args(arguments)
     unknown = sorted(set(given.documents) - set(documents()))
@@ -279,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="documents") as temporary:
         folder = (given.folder or Path(temporary)).resolve()
         for document in given.documents or documents():
-            total += check(document, folder, given.fast, given.list)
+            total += check(document, folder, given.fast)
     print(", ".join(f"{total[kind]} {kind}" for kind in ("ran", "failed", "not run")))
     return 1 if total["failed"] else 0
 

@@ -26,7 +26,7 @@ NOT_RUN = [
     (r"ghgs (train|table) .*runs/peers|ghgs evaluate .*train: 48", "needs 60 people, or runs of theirs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
     (r"python scripts/mutate\.py", "runs the whole suite"),
-    (r"python -m pytest -m gpu|python benchmarks/gpu\.py (?!.*--dry)", "needs a GPU and a checkout"),
+    (r"python -m pytest -m gpu|python benchmarks/gpu\.py(?!.*--dry)", "needs a GPU and a checkout"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python scripts/drill\.py", "trains twelve runs, killed ten times"),

@@ -193,24 +193,6 @@ def test_predict_runs_there(tmp_path, monkeypatch):
     assert list((tmp_path / "run").glob("*.ply"))
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [["model=hull"], ["model=paper"], ["model=hull", "skip=fast"]],
-    ids=" ".join,
-)
-def test_the_host_waits_once(overrides):
-    """One synchronization, for the plan: check of the batch, extent of the subject, numbers of tokens and
-    Gaussians."""
-    waits = []
-    for size in (1, 2):
-        with torch.no_grad(), pretend_device(True) as log:
-            model, batch = make_model(*overrides).eval().to(DEVICE), make_batch(size, 4, 56, 42).to(DEVICE)
-            log.clear()
-            predicted(model, batch)
-        waits.append(log.waits.total())
-        assert waits[-1] == 1, log.waits.most_common()
-
-
 def test_the_hull_of_larger_photographs_is_found_without_asking_for_the_number_of_rays(monkeypatch):
     """As on a CPU, although the rays are padded by repeating the first one."""
     monkeypatch.setattr(box, "RESOLUTION", 28)

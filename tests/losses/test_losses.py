@@ -11,68 +11,34 @@ from ghgs_lit.geometry import chamfer as geometry_chamfer
 from ghgs_lit.geometry.chamfer import chamfer, chamfer_of_rows, nearest, nearest_by_products
 from ghgs_lit.losses import terms
 from ghgs_lit.metrics.functional import ssim_map
-from ghgs_lit.types import (
-    Batch,
-    Cameras,
-    DepthMaps,
-    Gaussians,
-    Points,
-    Prediction,
-    Rendering,
-    Targets,
-)
+from ghgs_lit.types import DepthMaps, Rendering
 from tests.helpers.losses import losses_of
+from tests.helpers.training import Standin, example_batch
 
 
-def _cameras(*shape: int, height: int, width: int) -> Cameras:
-    return Cameras(
-        torch.eye(3).expand(*shape, 3, 3).clone(), torch.eye(4).expand(*shape, 4, 4).clone(), height, width
-    )
-
-
-def _example(seed: int = 0, body: bool = True, depths: bool = True):
+def _example(body: bool = True, depths: bool = True):
     """A prediction, its rendering and a batch: two people in two views with one target."""
-    g = torch.Generator().manual_seed(seed)
-    b, v, h, w = 2, 2, 16, 18
-    cameras = _cameras(b, v, height=h, width=w)
-    masks = torch.rand(b, v, h, w, generator=g) > 0.5
-    points = torch.rand(b, v, h, w, 3, generator=g)
-    depth = torch.rand(b, v, h, w, generator=g) + 1
-    valid = torch.rand(b, v, h, w, generator=g) > 0.2
-    n = 4
-    gaussians = Gaussians(
-        torch.rand(n, 3), torch.rand(n, 4), torch.rand(n, 3), torch.rand(n), torch.rand(n, 3), (2, 2)
+    g = torch.Generator().manual_seed(0)
+    batch = example_batch(views=2)
+    shape = batch.masks.shape
+    batch = dataclasses.replace(
+        batch,
+        masks=torch.rand(shape, generator=g) > 0.5,
+        body_vertices=batch.body_vertices if body else None,
+        depths=torch.rand(shape, generator=g) + 1 if depths else None,
     )
-    prediction = Prediction(
-        gaussians=gaussians,
+    prediction = Standin()(batch)
+    depth, valid = torch.rand(shape, generator=g) + 1, torch.rand(shape, generator=g) > 0.2
+    pixels = torch.rand(*shape, 3, generator=g)
+    prediction = dataclasses.replace(
+        prediction,
         depth=depth,
         depth_valid=valid,
-        points=Points(
-            points,
-            valid,
-            torch.zeros(0, 3),
-            torch.zeros(0, dtype=torch.bool),
-            torch.zeros(0, dtype=torch.int64),
-        ),
+        points=dataclasses.replace(prediction.points, pixels=pixels, valid=valid),
         depth_maps=DepthMaps(depth, valid, torch.ones_like(depth)),
     )
-    targets = Targets(
-        torch.rand(b, 1, 3, h, w, generator=g),
-        torch.ones(b, 1, h, w, dtype=torch.bool),
-        _cameras(b, 1, height=h, width=w),
-    )
-    batch = Batch(
-        images=torch.rand(b, v, 3, h, w, generator=g),
-        masks=masks,
-        cameras=cameras,
-        targets=targets,
-        body_vertices=[torch.rand(30, 3, generator=g) for _ in range(b)] if body else None,
-        depths=torch.rand(b, v, h, w, generator=g) + 1 if depths else None,
-    )
-    rendering = Rendering(
-        torch.rand(b, 1, 3, h, w, generator=g), torch.ones(b, 1, 1, h, w), torch.ones(b, 1, 1, h, w)
-    )
-    return prediction, rendering, batch
+    image, ones = torch.rand(2, 1, 3, *shape[2:], generator=g), torch.ones(2, 1, 1, *shape[2:])
+    return prediction, Rendering(image, ones, ones), batch
 
 
 def _reference_chamfer(a: torch.Tensor, b: torch.Tensor) -> float:

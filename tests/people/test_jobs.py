@@ -30,21 +30,30 @@ def contents(root: Path) -> dict[str, bytes]:
 
 @dataclass(frozen=True)
 class Counting:
-    """A source that logs loaded names in ``log``, and fails on request."""
+    """A source that logs loaded names and processes in ``log``, waits ``pause`` seconds, and fails on
+    request."""
 
-    source: ScanSource
+    source: ScanSource | None
     log: Path
     fail: tuple[str, ...] = ()
+    pause: float = 0.0
 
     def load(self, name):
         with open(self.log, "a") as file:
-            file.write(f"{name}\n")
+            file.write(f"{name} {os.getpid()}\n")
+        time.sleep(self.pause)
         if name in self.fail:
             raise InputError(f"{name}: expected a person; found a test")
         return self.source.load(name)
 
     def facing(self, name):
         return 0.0
+
+
+def logged(log: Path) -> list[tuple[str, int]]:
+    """Names and processes in a log."""
+    lines = log.read_text().splitlines() if log.exists() else []
+    return [(line.split()[0], int(line.split()[1])) for line in lines]
 
 
 @pytest.fixture(scope="module")
@@ -93,26 +102,10 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_goes_on(scans, referen
     source = Counting(ScanSource(scans), log)
     names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
     assert render_people(root, names, source, RIG, SMALL, 0, workers=0) == 3
-    assert log.read_text().split() == ["s1", "s2", "s3"]
+    assert [name for name, _ in logged(log)] == ["s1", "s2", "s3"]
     assert contents(root) == reference
     assert not (root / "rendering" / "tmp").exists()
     assert render_people(root, names, source, RIG, SMALL, 0, workers=0) == 0
-
-
-@dataclass(frozen=True)
-class Slow:
-    """A source that logs loaded names in ``log``; all people are invalid."""
-
-    log: Path
-
-    def load(self, name):
-        with open(self.log, "a") as file:
-            file.write(f"{name}\n")
-        time.sleep(0.3)
-        raise InputError(f"{name}: expected a person; found a test")
-
-    def facing(self, name):
-        return 0.0
 
 
 def test_an_interrupted_rendering_begins_no_further_people(tmp_path, monkeypatch):
@@ -120,10 +113,11 @@ def test_an_interrupted_rendering_begins_no_further_people(tmp_path, monkeypatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr(jobs.log, "warning", interrupt)
-    names = {"train": [f"s{i}" for i in range(12)]}
+    names = [f"s{i}" for i in range(12)]
+    slow = Counting(None, tmp_path / "log", fail=tuple(names), pause=0.3)
     with pytest.raises(KeyboardInterrupt):
-        render_people(tmp_path / "out", names, Slow(tmp_path / "log"), RIG, SMALL, 0, workers=2)
-    assert len((tmp_path / "log").read_text().split()) < 12
+        render_people(tmp_path / "out", {"train": names}, slow, RIG, SMALL, 0, workers=2)
+    assert len(logged(tmp_path / "log")) < 12
 
 
 def render_at_once(barrier, root: Path, scans: Path, log: Path) -> None:
@@ -141,30 +135,13 @@ def test_two_processes_at_once_share_the_work(scans, reference, tmp_path):
     for process in processes:
         process.join()
         assert process.exitcode == 0
-    assert sorted(log.read_text().split()) == ["s0", "s1", "s2", "s3"]  # each rendered once
+    assert sorted(name for name, _ in logged(log)) == ["s0", "s1", "s2", "s3"]  # each rendered once
     assert contents(root) == reference
-
-
-@dataclass(frozen=True)
-class Stuck:
-    """A slow source that logs the loading process."""
-
-    source: ScanSource
-    log: Path
-
-    def load(self, name):
-        with open(self.log, "a") as file:
-            file.write(f"{os.getpid()}\n")
-        time.sleep(60)
-        return self.source.load(name)
-
-    def facing(self, name):
-        return 0.0
 
 
 def render_stuck(root: Path, scans: Path, log: Path) -> None:
     names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
-    render_people(root, names, Stuck(ScanSource(scans), log), RIG, SMALL, 0, workers=2)
+    render_people(root, names, Counting(ScanSource(scans), log, pause=60), RIG, SMALL, 0, workers=2)
 
 
 def lives(pid: int) -> bool:
@@ -179,9 +156,9 @@ def test_workers_end_with_the_process_that_started_them(scans, tmp_path):
     process = PREPARED.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
     process.start()
     limit = time.monotonic() + 300
-    while not (log.exists() and len(log.read_text().split()) == 2) and time.monotonic() < limit:
+    while len(logged(log)) < 2 and time.monotonic() < limit:
         time.sleep(0.05)
-    workers = [int(pid) for pid in log.read_text().split()]
+    workers = [pid for _, pid in logged(log)]
     assert all(map(lives, workers))
     process.kill()
     process.join()

@@ -67,42 +67,6 @@ def test_depth_never_mixes_two_surfaces():
         assert (np.abs(values - 1.5) < 1e-5).sum() > 50
 
 
-def test_vertices_project_into_the_mask_from_every_side():
-    """Renderings agree with their cameras: vertices project into the mask, depths lie on the surface."""
-    rng = subject_rng(3, "capsule")
-    capsule = trimesh.creation.capsule(height=1.2, radius=0.25, count=[64, 64])
-    capsule.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
-    rig = Rig()
-    person = rig.place(Person("capsule", (mesh_part(capsule),), None), rng)
-    cameras = rig.cameras(rig.yaws(rng)[::3, 0], 84, 56)
-    photographs = Studio(person, None).shoot(cameras)
-    vertices = torch.from_numpy(person.parts[0].vertices)
-    tall = vertices[:, 1].max().item()
-    radius = tall * 0.25 / 1.7
-    for n in range(len(photographs.masks)):
-        pixels, z = project(vertices, cameras.intrinsics[n], cameras.extrinsics[n])
-        column, row = pixels.floor().long().unbind(-1)
-        mask = photographs.masks[n]
-        grown = mask | np.roll(mask, 1, 0) | np.roll(mask, -1, 0) | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
-        assert grown[row, column].all()
-        assert 1.5 < z.min() < z.max() < 2.5
-        points = unproject_maps(torch.from_numpy(photographs.depths[n]), cameras[n]).numpy()[mask]
-        axis = np.stack(
-            (points[:, 0], points[:, 1] - np.clip(points[:, 1], radius, tall - radius), points[:, 2])
-        )
-        assert np.abs(np.linalg.norm(axis, axis=0) - radius).max() < 1.5e-3  # facets of 1 mm
-
-
-def test_texture_is_upright_and_bilinear():
-    """Textures are neither flipped nor shifted by half a texel, and repeat."""
-    texture = plain((0, 0, 0), 2)
-    texture[0, 0] = (255, 0, 0)  # top left
-    texture[1, 1] = (0, 255, 0)  # bottom right
-    image, _, _ = shoot([quad(half=0.5, texture=texture)], front_camera(32), samples=1)
-    assert image[12, 12, 0] > 0.8 > 0.2 > image[12, 12, 1]
-    assert image[19, 19, 1] > 0.8 > 0.2 > image[19, 19, 0]
-
-
 def sample_texture(texture, uv):
     """Bilinear colours [n, 3] of a repeating texture, by SciPy in float64."""
     height, width, _ = texture.shape

@@ -17,6 +17,7 @@ from ghgs_people.thuman2 import THuman2
 from scripts.miniatures import thuman2 as miniature
 from scripts.miniatures.scans import make_scans
 from tests.data.test_pickles import Call
+from tests.helpers.captures import truncate
 from tests.helpers.people import V4
 
 SIZE = 64
@@ -54,14 +55,12 @@ def module(folder, **changes):
     return Small(**{**arguments, **changes}).build(V4, {"name": "release", "training_views": [3]})
 
 
-def camera(folder, change):
-    path = folder / f"root/train/parm/{VIEW}_extrinsic.npy"
+def change_array(path, change):
     np.save(path, change(np.load(path)))
 
 
-def intrinsics(folder, change):
-    path = folder / f"root/train/parm/{VIEW}_intrinsic.npy"
-    np.save(path, change(np.load(path)))
+def camera(folder, change, matrix="extrinsic"):
+    change_array(folder / f"root/train/parm/{VIEW}_{matrix}.npy", change)
 
 
 def with_nan(pose):
@@ -79,12 +78,7 @@ def another_id(folder):
 
 
 def body(folder, change):
-    path = folder / "root/train/smpl/0000/vertices.npy"
-    np.save(path, change(np.load(path)))
-
-
-def truncate(path):
-    path.write_bytes(path.read_bytes()[:300])
+    change_array(folder / "root/train/smpl/0000/vertices.npy", change)
 
 
 RENDERED = {
@@ -133,11 +127,11 @@ RENDERED = {
         r"3\.png: expected the body in its mask \(IoU of 0\.50 or more\); found IoU 0\.",
     ),
     "intrinsics of another size": (
-        lambda f: intrinsics(f, lambda matrix: matrix * [[2], [2], [1]]),
+        lambda f: camera(f, lambda matrix: matrix * [[2], [2], [1]], "intrinsic"),
         r"3\.png: expected the body in its mask \(IoU of 0\.50 or more\); found IoU 0\.",
     ),
     "no focal length": (
-        lambda f: intrinsics(f, lambda matrix: matrix * [[0], [1], [1]]),
+        lambda f: camera(f, lambda matrix: matrix * [[0], [1], [1]], "intrinsic"),
         r"3_intrinsic\.npy: expected focal lengths above 0; found 0\.0, ",
     ),
     "one position of another subject": (

@@ -1,8 +1,10 @@
-"""Fixture: tests of the renderer start with one thread."""
+"""Fixture: tests of the renderer start with one thread, and without capacities of earlier renderings."""
 
 import pytest
 
+from ghgs_lit.rendering import capacity
 
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread(one_thread):
-    """Every test of this folder has one thread."""
+
+@pytest.fixture(autouse=True)
+def _fresh(one_thread):
+    capacity._expected.clear()

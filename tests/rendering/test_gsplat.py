@@ -13,7 +13,6 @@ import torch
 from ghgs_lit.rendering import (
     BackendUnavailable,
     RasterSettings,
-    capacity,
     gsplat_backend,
     reference,
     render,
@@ -96,12 +95,6 @@ def test_gsplat_refuses_constants_it_does_not_know():
     """A constant that is compiled into gsplat cannot be changed silently."""
     with pytest.raises(ValueError, match="alpha_max"):
         gsplat_backend.rasterize(cloud(5), camera_ring(1, 8, 8), RasterSettings(alpha_max=0.9999), 0.5)
-
-
-@pytest.fixture(autouse=True)
-def forgotten():
-    """Resets the capacities that earlier renderings needed."""
-    capacity._expected.clear()
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

@@ -6,18 +6,13 @@ import torch
 
 from ghgs_lit.extents import bucket_size
 from ghgs_lit.ops.intersections import TILE, intersections
-from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
+from ghgs_lit.rendering import RasterSettings, gsplat_backend, reference
 from ghgs_lit.rendering.capacity import defer_checks, repeat_until_sufficient
 from tests.helpers.gsplat import InParts, functions
 from tests.helpers.kernels import DEVICE as KERNELS
 from tests.helpers.kernels import kernels
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.splats import camera_ring, cloud
-
-
-@pytest.fixture(autouse=True)
-def forgotten():
-    capacity._expected.clear()
 
 
 def splats(images, count, height, width, seed=0):

@@ -55,30 +55,12 @@ def test_two_threads_of_the_caller_at_once():
     assert all(torch.equal(image, wanted) for image in found)
 
 
-def _render_in_child(queue):
-    torch.set_num_threads(2)
-    queue.put(float(render(body(500, 32), camera_ring(2, 32, 32), "cpu").image.sum()))
-
-
-@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
-def test_after_a_fork():
-    """A forked process does not hang on the parent's threads."""
-    torch.set_num_threads(2)
-    wanted = float(render(body(500, 32), camera_ring(2, 32, 32), "cpu").image.sum())
-    context = multiprocessing.get_context("fork")
-    queue = context.Queue()
-    children = [context.Process(target=_render_in_child, args=(queue,)) for _ in range(2)]
-    [child.start() for child in children]
-    found = [queue.get(timeout=60) for _ in children]
-    [child.join(timeout=60) for child in children]
-    assert found == [wanted, wanted]
-
-
 class _Renderings(torch.utils.data.Dataset):
     def __len__(self):
         return 8
 
     def __getitem__(self, index):
+        torch.set_num_threads(2)
         gaussians = with_gradients(body(500, 32, seed=index))
         image = render(gaussians, camera_ring(1, 32, 32), "cpu").image
         image.square().sum().backward()
@@ -89,7 +71,7 @@ class _Renderings(torch.utils.data.Dataset):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="beside CUDA, PyTorch refuses gradients after a fork")
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
 def test_training_in_four_workers_of_a_data_loader():
-    """Rendering with gradients works in worker processes."""
+    """Forked processes render with gradients, and do not hang on the parent's threads."""
     # In a process of its own: where a backward pass ran on another device,
     # PyTorch refuses one after a fork.
     run_prepared(train_in_workers)

@@ -2,14 +2,17 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import SubjectBox, VisualHull
-from ghgs_lit.method.bounds.box import subject_box
+from ghgs_lit.method.bounds.box import RESOLUTION, subject_box
+from ghgs_lit.method.bounds.hull import hull_bounds
 from ghgs_lit.method.bounds.rays import cut_sides, depths_in_box, dilate, silhouettes, votes_outside
+from ghgs_lit.ops.ray_marching import march
 from ghgs_lit.types import Batch, DepthBounds
 from tests.helpers.cameras import camera_ring
 from tests.helpers.figures import PARTS
@@ -215,3 +218,132 @@ def test_bounds_that_are_too_close_are_moved_apart_to_the_least_thickness():
     found = SubjectBox()._make_valid(DepthBounds(near, far))
     torch.testing.assert_close(found.near.flatten(), torch.tensor([1.992, 2.0, 0.1, 0.1]))
     torch.testing.assert_close(found.far.flatten(), torch.tensor([2.012, 2.5, 0.12, 1e6]))
+
+
+def voting(batch, **options):
+    stage = SubjectBox(**options)
+    coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, stage.dilation)
+    return stage._select_voting(coarse).tolist()
+
+
+def spoil(batch, wrong):
+    masks = batch.masks.clone()
+    size = masks.shape[2]
+    if wrong == "noise":
+        masks[0, -1] = torch.rand(masks.shape[2:], generator=torch.Generator().manual_seed(0)) < 0.3
+    elif wrong == "half":
+        masks[0, -1, size // 2 :] = False
+    elif wrong == "one pixel":
+        masks[0, -1] = False
+        masks[0, -1, 3, 5] = True
+    elif wrong == "empty":
+        masks[0, -1] = False
+    elif wrong == "shifted":
+        masks[0, -1] = masks[0, -1].roll(size // 3, -1)
+    return dataclasses.replace(batch, masks=masks)
+
+
+@pytest.mark.parametrize("wrong", ["noise", "half", "one pixel", "shifted"])
+@pytest.mark.parametrize("views", [3, 4, 5])
+@pytest.mark.parametrize("stage", [SubjectBox(), VisualHull()], ids=["box", "hull"])
+def test_one_wrong_mask_cuts_nothing_off(stage, views, wrong):
+    """The true surface of the other views lies within their bounds."""
+    batch = make_batch(1, views, 112, 112)
+    spoiled = spoil(batch, wrong)
+    assert voting(spoiled) == [[True] * (views - 1) + [False]]
+    found = stage(spoiled)
+    seen = batch.masks.clone()
+    seen[:, -1] = False
+    assert (found.near <= batch.depths)[seen].all()
+    assert (found.far >= batch.depths)[seen].all()
+
+
+#: Views, image size, defect of the last mask, options, and which of the views vote.
+VOTES = {
+    **{
+        f"right masks of {views} views": (views, size, None, {}, [True] * views)
+        for views in (2, 3, 4, 5)
+        for size in ((56, 56), (140, 98))
+    },
+    "an empty mask takes no vote away": (4, (56, 56), "empty", {}, [True] * 3 + [False]),
+    # with two views it is unknown which one is wrong
+    "a half of two": (2, (112, 112), "half", {}, [True, True]),
+    "a shifted one of two": (2, (112, 112), "shifted", {}, [True, True]),
+    # with a tolerance, its vote alone carves nothing; without it, the others would have to agree
+    "an outvoted one": (5, (112, 112), "half", {"tolerance": 1}, [True] * 5),
+}
+
+
+@pytest.mark.parametrize("name", VOTES)
+def test_which_masks_vote(name):
+    views, size, wrong, options, expected = VOTES[name]
+    assert voting(spoil(make_batch(1, views, *size), wrong), **options) == [expected]
+
+
+def by_hand(batch, start, tolerance, samples, v, row, column):
+    """First and last allowed depths of one ray in float64; masks are not dilated, and no ray leaves the
+    frames."""
+    masks = batch.masks[0].numpy()
+    intrinsics, extrinsics = (
+        x[0].double().numpy() for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)
+    )
+    near, far = (float(bound[0, v, row, column]) for bound in (start.near, start.far))
+    step, allowed = (far - near) / samples, []
+    for s in range(samples):
+        z = near + (s + 0.5) * step
+        ray = np.linalg.inv(intrinsics[v]) @ [column + 0.5, row + 0.5, 1]
+        world = extrinsics[v, :3, :3].T @ (z * ray - extrinsics[v, :3, 3])
+        votes = 0
+        for u in range(len(masks)):
+            x, y, w = intrinsics[u] @ (extrinsics[u, :3, :3] @ world + extrinsics[u, :3, 3])
+            votes += u != v and not masks[u, int(y / w), int(x / w)]
+        allowed += [z] if votes <= tolerance else []
+    return (allowed[0] - step / 2, allowed[-1] + step / 2) if allowed else (near, far)
+
+
+@pytest.mark.parametrize("by_kernel", [True, False])
+@pytest.mark.parametrize("tolerance", [0, 1])
+def test_a_ray_ends_where_the_masks_of_the_other_views_end(monkeypatch, tolerance, by_kernel):
+    """Both searches equal the definition of the hull, ray by ray."""
+    if not by_kernel:
+        monkeypatch.setitem(march.fits, "cpu", lambda *_: False)
+    batch = make_batch(1, 4, 56, 70, zoom=0.6)
+    start = DepthBounds(*(torch.full(batch.masks.shape, z) for z in (1.6, 2.5)))
+    arguments = (batch.masks, batch.cameras, start, 0, tolerance, 12)
+    found = hull_bounds(*arguments)
+    rays = batch.masks[0].nonzero()[::37].tolist()
+    assert len(rays) > 20
+    expected = torch.tensor([by_hand(batch, start, tolerance, 12, *ray) for ray in rays])
+    ends = torch.stack([torch.stack([b[0, v, i, j] for b in (found.near, found.far)]) for v, i, j in rays])
+    assert ((ends - expected).abs() < 1e-4).all(-1).float().mean() > 0.98
+
+
+SCENES = {
+    "batch": {"batch": 2, "views": 4, "height": 70, "width": 98},
+    "coarse": {"batch": 1, "views": 3, "height": 182, "width": 168},
+    "cut": {"batch": 2, "views": 3, "zoom": 1.6},
+    "opposite": {"batch": 1, "views": 2},
+}
+
+
+def with_extreme_masks(batch: Batch) -> Batch:
+    """Views with an empty mask, a full mask and a mask of a single pixel."""
+    masks = batch.masks.clone()
+    masks[0, 0] = False
+    masks[-1, 1] = True
+    if masks.shape[1] > 2:
+        masks[-1, 2] = False
+        masks[-1, 2, 20, 20] = True
+    return dataclasses.replace(batch, masks=masks)
+
+
+@pytest.mark.parametrize("change", [lambda batch: batch, with_extreme_masks], ids=["clean", "spoiled"])
+@pytest.mark.parametrize("tolerance", [0, 1])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_kernel_gives_the_bounds_of_plain_pytorch(monkeypatch, scene, tolerance, change):
+    batch = change(make_batch(**SCENES[scene]))
+    found = VisualHull(tolerance=tolerance)(dataclasses.replace(batch))
+    monkeypatch.setitem(march.fits, "cpu", lambda *_: False)
+    expected = VisualHull(tolerance=tolerance)(dataclasses.replace(batch))
+    assert (found.near != expected.near).float().mean() < 1e-4
+    assert (found.far != expected.far).float().mean() < 1e-4
