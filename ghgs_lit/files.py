@@ -181,23 +181,6 @@ def require_no_links(directory: Path, names: Iterable[str]) -> None:
             require(not each.is_symlink(), str(each), "a file or folder of the run", "a link")
 
 
-def append_line(path: Path, text: str) -> None:
-    """Append ``text`` as a new line, also after an unfinished line of a killed process.
-
-    Args:
-        path: the file; it and its folders are created if missing.
-        text: without a newline at the end.
-
-    Raises:
-        OSError: the file is a link, or cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+b", opener=lambda p, flags: os.open(p, flags | os.O_NOFOLLOW, 0o664)) as file:
-        file.seek(max(0, file.tell() - 1))
-        is_torn = file.read(1) not in (b"", b"\n")
-        file.write((("\n" if is_torn else "") + text + "\n").encode())
-
-
 def _remove_leftovers(path: Path) -> None:
     prefix = f".{path.name}.{socket.gethostname()}."
     for leftover in path.parent.glob(f"{prefix}*.tmp"):

@@ -8,7 +8,7 @@ import json
 import os
 import stat
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,22 +171,6 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     return read_parsed(
         path, "CSV with a header", lambda text: list(csv.DictReader(io.StringIO(text, newline="")))
     )
-
-
-def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
-    """Iterate over the mappings of a JSON Lines file, without other lines, such as unfinished ones.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    require_file(path, "a mapping in JSON on each line")
-    for line in path.read_bytes().splitlines():
-        try:
-            entry = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(entry, dict):
-            yield entry
 
 
 def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray":

@@ -68,10 +68,10 @@ class Drill:
 
     def session_of(self, process: subprocess.Popen) -> dict | None:
         """The current session of a process; None: it is not training."""
-        for path in self.sweep.glob("*/sessions.jsonl"):
-            lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
-            if lines and lines[-1].get("pid") == process.pid:
-                return lines[-1]
+        for path in self.sweep.glob("*/run.json"):
+            sessions = json.loads(path.read_text())["sessions"]
+            if sessions and sessions[-1]["pid"] == process.pid and "outcome" not in sessions[-1]:
+                return sessions[-1]
         return None
 
     def wait_for_training(self, process: subprocess.Popen) -> bool:
@@ -138,7 +138,7 @@ def faults_of(run: Path, steps: int) -> list[str]:
     """Faults of a completed run."""
     every, validations = list(range(1, steps + 1)), list(range(VALIDATION, steps + 1, VALIDATION))
     results = json.loads((run / "metrics.json").read_text())
-    sessions = [json.loads(line) for line in (run / "sessions.jsonl").read_text().splitlines()]
+    sessions = json.loads((run / "run.json").read_text())["sessions"]
     last, best = (
         torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True) for name in ("last", "best")
     )
@@ -197,7 +197,7 @@ def main() -> int:
     faults += ["expected a table of all seeds"] * (
         "No results yet" in said or f"{len(SEEDS)} seeds" not in said
     )
-    sessions = sum(path.read_text().count('"started"') for path in drill.sweep.glob("*/sessions.jsonl"))
+    sessions = sum(path.read_text().count('"started"') for path in drill.sweep.glob("*/run.json"))
     print("\n".join(faults))
     print(f"{len(runs)} runs in {sessions} sessions, {len(faults)} faults, {time.monotonic() - begin:.0f} s")
     return 1 if faults else 0

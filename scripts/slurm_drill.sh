@@ -100,7 +100,7 @@ tail -n 2 "$out/log/timed"
 step "sbatch and srun; scontrol requeue after 20 s of training"
 job=$(sbatch --parsable --output="$out/log/requeued" --open-mode=append --ntasks=1 --wrap \
     "srun $(printf '%q ' "${train[@]}" seed=1 "hydra.run.dir=$out/requeued")")
-while ! grep -qs '"started"' "$out/requeued/sessions.jsonl"; do sleep 1; done
+while ! grep -qs '"started"' "$out/requeued/run.json"; do sleep 1; done
 sleep 20
 scontrol requeue "$job"
 while squeue --noheader --job="$job" 2> /dev/null | grep -q .; do sleep 1; done
@@ -121,9 +121,9 @@ for name in ("sweep", "timed", "requeued"):
         whole = next(out.glob(f"whole/{json.loads(path.read_text())['provenance']['config_hash']}"))
         a, b = (torch.load(r / "checkpoints/last.ckpt", weights_only=True)["state_dict"] for r in (run, whole))
         differing += (count := sum(not torch.equal(a[key], b[key]) for key in a | b))
-        lines = [json.loads(line) for line in (run / "sessions.jsonl").read_text().splitlines()]
-        steps = [line["steps"] for line in lines if "steps" in line]
-        resumed = [line["resumed"] for line in lines if "started" in line]
+        sessions = json.loads((run / "run.json").read_text())["sessions"]
+        steps = [session["steps"] for session in sessions if "steps" in session]
+        resumed = [session["resumed"] for session in sessions]
         whole_runs += name != "sweep" and len(steps) < 2
         print(f"{name}/{run.name}: steps {steps}, resumed {resumed}; {count} of {len(a)} tensors differ")
 runs = len(list(out.glob("*/**/metrics.json")))

@@ -15,7 +15,6 @@ from safetensors.torch import save_file
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import (
-    append_line,
     is_locked,
     lock,
     lock_owner,
@@ -238,13 +237,6 @@ def test_one_rule_for_files_that_exist(tmp_path):
         require_free(tmp_path / name, "out", overwrite=True)
     with pytest.raises(InputError, match="expected a file to write; found 'a directory'"):
         require_free(tmp_path, "out", overwrite=True)
-
-
-def test_no_line_is_appended_through_a_link(tmp_path):
-    target = link(tmp_path / "sessions.jsonl", "precious")
-    with pytest.raises(OSError, match="symbolic links"):
-        append_line(tmp_path / "sessions.jsonl", "{}")
-    assert target.read_text() == "precious"
 
 
 @pytest.mark.parametrize("place", ["train.log", "csv", "csv/metrics.csv"])

@@ -19,7 +19,6 @@ from ghgs_lit.parsing import (
     LARGEST,
     find_path,
     read_json,
-    read_lines_of_json,
     read_npy,
     read_rows,
     read_text,
@@ -159,19 +158,12 @@ def test_foreign_content_of_files_of_this_program(tmp_path):
 @pytest.mark.parametrize("content", [*FOREIGN, b"seed: text\ntrainer: 3\ndata: []\nrecalibration: {}"])
 def test_runs_of_foreign_content_are_read_or_named(tmp_path, content):
     run = RunDirectory(tmp_path)
-    for name in ("config.yaml", "sessions.jsonl", "csv/metrics.csv", ".hydra/overrides.yaml"):
+    for name in ("config.yaml", "csv/metrics.csv", ".hydra/overrides.yaml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(content)
-    run.sessions()
     assert not run.done
     with contextlib.suppress(InputError):
         read_sweep([tmp_path])
-
-
-def test_lines_that_a_killed_process_left_are_skipped(tmp_path):
-    path = tmp_path / "a.jsonl"
-    path.write_bytes(b'{"a": 1}\n5\n{"a": \n[[[\n\xff\n{"b": 2}')
-    assert list(read_lines_of_json(path)) == [{"a": 1}, {"b": 2}]
 
 
 #: Stored file, name given by a file or user, accepted suffixes.

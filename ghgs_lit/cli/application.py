@@ -26,16 +26,12 @@ from ghgs_lit.errors import require
 from ghgs_lit.files import require_no_links
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.processes import interruptible
-from ghgs_lit.runs.run import SESSIONS, WRITTEN, RunDirectory
+from ghgs_lit.runs.run import WRITTEN, RunDirectory
 from ghgs_lit.runtime.allocation import collect_garbage_again
 from ghgs_lit.runtime.cores import let_children_sleep
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
 read_as_ghgs()
-
-
-#: Names that a run appends to or that libraries write in place, in addition to the log.
-_WRITTEN_IN_PLACE = (*WRITTEN, SESSIONS)
 
 
 @interruptible()
@@ -73,7 +69,7 @@ def work(cfg: DictConfig, name: str, argv: Sequence[str]) -> object:
         if verb.begins_run and not is_dry:
             directory.start(verb)
         if not is_dry:
-            require_no_links(directory.path, (*_WRITTEN_IN_PLACE, f"{hydra_node.job.name}.log"))
+            require_no_links(directory.path, (*WRITTEN, f"{hydra_node.job.name}.log"))
         collect_garbage_again()
         let_children_sleep()
         return verb.run()

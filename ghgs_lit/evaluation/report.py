@@ -35,7 +35,7 @@ def measure_and_write(
 ) -> Path:
     """Measure methods as configured, print the means, and write the results.
 
-    Writes ``metrics.json``, ``metrics.csv`` and ``pictures/``. Call
+    Writes ``metrics.json`` and ``pictures/``. Call
     :func:`ghgs_lit.evaluation.protocols.check_evaluation` first.
 
     Args:

@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import omegaconf
 from hydra.core.hydra_config import HydraConfig
@@ -21,16 +21,12 @@ from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.results import config_hash
 from ghgs_lit.runs.run import AUTO, CURVES, MARKER, PLAN, RunDirectory, find_runs_of_job
 
-if TYPE_CHECKING:
-    from ghgs_lit.cli.verb import Training
-    from ghgs_lit.cli.verbs import Train as TrainVerb
-
 BUSY = "busy"  #: Return value of a job whose run is locked by another process
 _PATIENCE = 300.0  # seconds to wait for the first of several processes to begin
 _TASK = "hydra.overrides.task"  # key of a sweep's command-line overrides in its multirun.yaml
 
 Train = Callable[[Run, Path, dict[str, Any]], float | None]
-"""Function ``(run, directory, stats) -> metric``; it fills ``stats`` for ``sessions.jsonl``."""
+"""Function ``(run, directory, stats) -> metric``; it fills ``stats`` for ``run.json``."""
 
 
 def in_sweep() -> bool:
@@ -106,7 +102,7 @@ def register_resolvers() -> None:
         register(name, resolver, replace=True)
 
 
-def train_once(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
+def train_once(directory: RunDirectory, run: Run, train: Train) -> float | str | None:
     """Train a run, resuming it where it stands, in the process that locks it.
 
     Args:
@@ -139,7 +135,7 @@ def train_once(directory: RunDirectory, run: "Training", train: Train) -> float 
             return train(run, path, stats)
 
 
-def join_training(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
+def join_training(directory: RunDirectory, run: Run, train: Train) -> float | str | None:
     """Train a run in a further process of a training whose first process is in :func:`train_once`.
 
     Args:
@@ -179,7 +175,7 @@ def check_launcher(run: Run, launcher: str) -> None:
     require(fits, "trainer.devices", expected, run.plain["trainer"]["devices"])
 
 
-def check_config(run: "TrainVerb") -> None:
+def check_config(run: Run) -> None:
     """Check that a run can train.
 
     Raises:

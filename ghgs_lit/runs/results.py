@@ -1,12 +1,9 @@
-"""Results of a run: ``metrics.json`` and ``metrics.csv``, with one row per subject, target and method,
+"""Results of a run: ``metrics.json``, with one row per subject, target and method,
 and their provenance (configuration, code, versions, machine)."""
 
-import csv
 import datetime
 import hashlib
 import importlib.metadata
-import io
-import itertools
 import json
 import math
 import platform
@@ -41,7 +38,7 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 def metric_names(rows: Sequence[Row]) -> list[str]:
     """Names of the metrics in rows, in order of appearance."""
-    names = dict.fromkeys(itertools.chain.from_iterable(rows))
+    names = dict.fromkeys(name for row in rows for name in row)
     return [name for name in names if name not in KEYS]
 
 
@@ -87,7 +84,7 @@ def to_json_data(value: Any) -> Any:
 
 
 def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str, Any]) -> Path:
-    """Write ``metrics.csv``, then ``metrics.json``, which marks the run as complete.
+    """Write ``metrics.json``, which marks the run as complete.
 
     Args:
         directory: Directory of the run.
@@ -102,21 +99,6 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     """
     if not rows:
         raise InputError("evaluation: expected at least one subject and target; found none")
-    # Columns that distinguish the rows of concatenated tables.
-    origin = {
-        "data": provenance.get("data", {}).get("name"),
-        "split": provenance.get("data", {}).get("split"),
-        "protocol": provenance.get("protocol", {}).get("metrics"),
-        "seed": provenance.get("seed"),
-        "config_hash": provenance.get("config_hash"),
-    }
-    known = set().union(*rows)
-    columns = [*(key for key in KEYS if key in known), *metric_names(rows), *origin]
-    table = io.StringIO()
-    writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in to_json_data(rows))
-    write_text_atomically(directory / "metrics.csv", table.getvalue())
     content = {
         "format_version": FORMAT_VERSION,
         "provenance": provenance,

@@ -1,22 +1,20 @@
 """A run on disk: its identity, how it resumes, the process that holds it, and its sessions.
 
-``run.json`` marks a folder as a run and contains the hash of its configuration. Files are deleted only in
-such a folder and only by the process that holds the lock ``.lock``. A run is done when ``metrics.json``
-of its configuration exists, which is written last. ``sessions.jsonl`` has one line for the start of each
-process and one for its end, which is missing if the process was killed. No file contains the path of the
-folder, so that a run can be moved.
+``run.json`` marks a folder as a run and contains the hash of its configuration and one session for each
+process that worked on it. It is written, and files are deleted, only by the process that holds the lock
+``.lock``. A run is done when ``metrics.json`` of its configuration exists, which is written last. No file
+contains the path of the folder, so that a run can be moved.
 """
 
 import contextlib
 import datetime
-import json
 import os
 import re
 import socket
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
@@ -24,7 +22,6 @@ from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import (
-    append_line,
     is_locked,
     lock,
     lock_owner,
@@ -32,16 +29,12 @@ from ghgs_lit.files import (
     resolve_path,
     write_text_atomically,
 )
-from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
+from ghgs_lit.parsing import read_json, read_yaml
 from ghgs_lit.runs.processes import is_queued_again, slurm_job
 from ghgs_lit.runs.results import config_hash, differences, read_results, validate
 
-if TYPE_CHECKING:
-    from ghgs_lit.cli.verb import Training
-
 AUTO = "auto"  #: Value of ``resume``: continue the run in the directory, if any
 MARKER = "run.json"
-SESSIONS = "sessions.jsonl"
 PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, in the sweep's folder
 #: TensorBoard's files; in a sweep they are in a folder named after overrides.
 CURVES = ("tensorboard/events.out.tfevents.*", "tensorboard/*=*/events.out.tfevents.*")
@@ -52,7 +45,6 @@ _FILES = (
     "csv/metrics.csv",
     "faults/step_*.pt",
     "init_from.txt",
-    "metrics.csv",
     "metrics.json",
     "pictures/model_v*.png",
     "pictures/step_*/*.png",
@@ -61,7 +53,7 @@ _FILES = (
 WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Their top-level names
 
 
-class Identity(BaseModel):
+class Marker(BaseModel):
     """Content of ``run.json``.
 
     Attributes:
@@ -69,6 +61,8 @@ class Identity(BaseModel):
         config_hash: Hash of the configuration.
         resume: Value of ``resume`` that the run began with.
         job: SLURM job that last worked on the run.
+        sessions: One entry per process that worked on the run; entries of killed processes have no
+            ``outcome``.
     """
 
     model_config = ConfigDict(strict=True)
@@ -76,6 +70,7 @@ class Identity(BaseModel):
     config_hash: str
     resume: str | None
     job: str | None
+    sessions: list[dict[str, Any]]
 
 
 def runs_in_order(sweep: Path) -> list[str]:
@@ -101,7 +96,6 @@ class RunDirectory:
         self.path = resolve_path(path)
         self.config_hash = config_hash
         self._lock = self.path / ".lock"
-        self._is_mine = False
 
     def of(self, run: Run) -> "RunDirectory":
         """Return the same directory, accepting only results of this run's configuration."""
@@ -151,21 +145,12 @@ class RunDirectory:
         """Description of the process that last locked the run, for messages."""
         return lock_owner(self._lock)
 
-    @contextlib.contextmanager
-    def claim(self) -> Iterator[bool]:
-        """Lock the run for this process (:func:`ghgs_lit.files.lock`).
-
-        Yields:
-            Whether this process holds the lock.
-        """
-        with lock(self._lock) as self._is_mine:
-            try:
-                yield self._is_mine
-            finally:
-                self._is_mine = False
+    def claim(self) -> contextlib.AbstractContextManager[bool]:
+        """Lock the run for this process, see :func:`ghgs_lit.files.lock`."""
+        return lock(self._lock)
 
     @property
-    def marker(self) -> Identity | None:
+    def marker(self) -> Marker | None:
         """Content of ``run.json``; None if the folder does not belong to a run.
 
         Raises:
@@ -174,9 +159,9 @@ class RunDirectory:
         path = self.path / MARKER
         if not path.is_file():
             return None
-        return validate(Identity, read_json(path, "a run's identity"), str(path))
+        return validate(Marker, read_json(path, "a run's identity"), str(path))
 
-    def start(self, run: "Training") -> str | None:
+    def start(self, run: Run) -> str | None:
         """Checkpoint from which a run starts in this directory. Writes nothing.
 
         Args:
@@ -195,8 +180,7 @@ class RunDirectory:
             checkpoint = resume if self._has(resume) else self.checkpoint
             return str(checkpoint) if checkpoint is not None else given
         owned = self.marker is not None
-        names = WRITTEN if owned else (*WRITTEN, SESSIONS)
-        there = [name for name in names if os.path.lexists(self.path / name)]
+        there = [name for name in WRITTEN if os.path.lexists(self.path / name)]
         if not there:
             return given
         if not (run.overwrite and owned):
@@ -205,7 +189,7 @@ class RunDirectory:
             require(not self._has(source), key, "a file outside the run that overwrite=true deletes", source)
         return given
 
-    def continues(self, run: "Training") -> bool:
+    def continues(self, run: Run) -> bool:
         """Whether the same command began the run in this directory."""
         marker = self.marker
         if marker is None or run.resume is None or marker.resume != run.resume:
@@ -226,7 +210,7 @@ class RunDirectory:
         ways += " weights, overwrite=true deletes a single run"
         return f"expected a directory without a run or other files of these names; found {there} ({ways})"
 
-    def begin(self, run: "Training") -> "Training":
+    def begin(self, run: Run) -> Run:
         """Turn the directory into that of a run, which this process must have claimed.
 
         Without a checkpoint to start from, previous output is deleted and the run trains from the
@@ -239,28 +223,24 @@ class RunDirectory:
             InputError: See :meth:`start`.
         """
         start = self.start(run)
-        marker = self.marker
-        is_same = self.continues(run)
-        if not self._has(start):
-            self._clear(run, with_sessions=not is_same)
-        known = marker if is_same or self._has(start) else None
-        identity = Identity(
-            id=known.id if known else uuid.uuid4().hex[:8],
-            config_hash=config_hash(run.plain),
-            resume=known.resume if known else run.resume,
-            job=slurm_job(),
-        )
-        write_text_atomically(self.path / MARKER, identity.model_dump_json(indent=1) + "\n")
+        goes_on = self._has(start)
+        known = {"id": uuid.uuid4().hex[:8], "resume": run.resume, "sessions": []}
+        if goes_on or self.continues(run):
+            known = self.marker.model_dump()
+        if not goes_on:
+            self._clear(run)
+        self._write(Marker(**{**known, "config_hash": config_hash(run.plain), "job": slurm_job()}))
         return run.replace(resume=start)
 
-    def _clear(self, run: "Training", with_sessions: bool) -> None:
-        """Delete the output of training, only in a run's folder that this process has claimed."""
+    def _write(self, marker: Marker) -> None:
+        write_text_atomically(self.path / MARKER, marker.model_dump_json(indent=1) + "\n")
+
+    def _clear(self, run: Run) -> None:
+        """Delete the output of training."""
         options = run.plain.get("callbacks", {}).values()
         names = (re.sub(r"\{.*?\}", "*", each["filename"]) for each in options if each and "filename" in each)
-        patterns = [*_FILES, *(f"checkpoints/{name}.ckpt" for name in names), *[SESSIONS] * with_sessions]
+        patterns = [*_FILES, *(f"checkpoints/{name}.ckpt" for name in names)]
         paths = [path for pattern in patterns for path in self.path.glob(pattern)]
-        if paths and not (self._is_mine and self.marker is not None):
-            raise RuntimeError(f"{self.path}: files are deleted in a run that this process has claimed only")
         for path in paths:
             path.unlink()
         for folder in {path.parent for path in paths} - {self.path}:
@@ -268,19 +248,13 @@ class RunDirectory:
                 folder.rmdir()
 
     def sessions(self) -> list[dict[str, Any]]:
-        """One entry per process that worked on the run; entries of killed processes have no ``outcome``."""
-        path = self.path / SESSIONS
-        sessions: list[dict[str, Any]] = []
-        for entry in read_lines_of_json(path) if path.exists() else ():
-            if "started" in entry:
-                sessions.append(entry)
-            elif sessions:
-                sessions[-1] |= entry
-        return sessions
+        """Sessions of ``run.json``; none if the folder does not belong to a run."""
+        marker = self.marker
+        return marker.sessions if marker is not None else []
 
     @contextlib.contextmanager
     def session(self, resumed: str | None = None) -> Iterator[dict[str, Any]]:
-        """Log start and end of this process in ``sessions.jsonl``.
+        """Log start and end of this process in ``run.json``; requires the lock, after :meth:`begin`.
 
         Args:
             resumed: Checkpoint that the process resumed from; logged as a relative path if it lies in the
@@ -291,16 +265,21 @@ class RunDirectory:
         """
         if self._has(resumed):
             resumed = str(resolve_path(resumed).relative_to(self.path))
-        process = {"host": socket.gethostname(), "pid": os.getpid()}
-        self._log("started", **process, resumed=resumed)
+        session = {"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), "resumed": resumed}
+        marker = self.marker
+        marker.sessions.append(session)
+        self._write(marker)
         stats: dict[str, Any] = {}
+        end = {"outcome": "done"}
         try:
             yield stats
         except BaseException as error:
             outcome = "failed" if isinstance(error, Exception) else "interrupted"
-            self._log("ended", outcome=outcome, error=str(error), **stats)
+            end = {"outcome": outcome, "error": str(error)}
             raise
-        self._log("ended", outcome="done", **stats)
+        finally:
+            session |= {"ended": _now(), **end, **stats}
+            self._write(marker)
 
     def find_first_session(self) -> dict[str, Any] | None:
         """Current session of the first of several processes of this training, with the absolute path of
@@ -312,9 +291,9 @@ class RunDirectory:
         resumed = last["resumed"]
         return {**last, "resumed": resumed and str(self.path / resumed)}
 
-    def _log(self, moment: str, **facts: Any) -> None:
-        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-        append_line(self.path / SESSIONS, json.dumps({moment: now, **facts}))
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
 
 
 def find_runs_of_job(folder: Path, pattern: str) -> list[RunDirectory]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
@@ -20,6 +20,7 @@ from tabulate import tabulate
 from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text, to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.registry import verb_class
+from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_writable, resolve_path, write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
@@ -27,12 +28,9 @@ from ghgs_lit.runs.processes import Interrupted, interruptible, print_how_to_go_
 from ghgs_lit.runs.results import config_hash
 from ghgs_lit.runs.run import PLAN, RunDirectory, runs_in_order
 
-if TYPE_CHECKING:
-    from ghgs_lit.cli.verbs import Train
-
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between checks of runs locked by other processes
-_OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
+_OUTPUTS = "config.yaml, checkpoints/, metrics.json, run.json, pictures and logs"
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class PlannedRun:
 
     overrides: tuple[str, ...]
     shown: tuple[str, ...]
-    run: "Train"
+    run: Run
     directory: RunDirectory
 
 

@@ -117,8 +117,8 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
     code, _, err = verb(where, "seed=2")
     assert code == 1
     assert len(err.splitlines()) == 1
-    assert "found metrics.csv of another configuration: seed: 1 -> 2 (" in err
-    assert "found metrics.csv (" in verb(where, "resume=null")[2]
+    assert "found metrics.json of another configuration: seed: 1 -> 2 (" in err
+    assert "found metrics.json (" in verb(where, "resume=null")[2]
 
 
 def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
@@ -221,14 +221,6 @@ def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path, key):
     else:
         assert train_until_killed(tmp_path, run) == [str(last)]
     assert last.exists()
-
-
-def test_nothing_is_deleted_without_the_lock(tmp_path):
-    """Two processes started at the same time must decide one after the other."""
-    train_until_killed(tmp_path)
-    with pytest.raises(RuntimeError, match="claimed"):
-        RunDirectory(tmp_path).begin(RUN.replace(overwrite=True))
-    assert (tmp_path / "checkpoints" / "last.ckpt").exists()
 
 
 def test_a_job_that_is_queued_again_does_not_overwrite_itself(tmp_path, monkeypatch):

@@ -54,20 +54,6 @@ def test_results_that_were_changed_are_refused(tmp_path, place, value, key):
     assert not RunDirectory(tmp_path).done
 
 
-def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
-    """A truncated line of ``sessions.jsonl`` must not hide the other sessions."""
-    run = RunDirectory(tmp_path)
-    with run.session():
-        pass
-    with open(tmp_path / "sessions.jsonl", "a") as file:
-        file.write('{"started": "2026-')
-    with run.session(resumed="x") as stats:
-        stats["steps"] = 3
-    first, second = run.sessions()
-    assert first["outcome"] == second["outcome"] == "done"
-    assert (second["resumed"], second["steps"]) == ("x", 3)
-
-
 def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
     """Neither a killed process nor a forked child that outlives it may block a run."""
     ready = PREPARED.Event()

@@ -53,7 +53,7 @@ def test_directories_of_a_users_own_hold_one_configuration_each(sweep):
     code, out, err = sweep(numbered, "seed=2")
     assert (code, len(err.splitlines())) == (1, 1)
     assert f"{sweep.directory / '0'}: expected a directory without a run" in err
-    assert "found metrics.csv of another configuration: seed: 1 -> 2 (" in err
+    assert "found metrics.json of another configuration: seed: 1 -> 2 (" in err
     code, out, _ = sweep(numbered, "seed=1,2")
     assert "2 runs: 2 done before" in out
     assert executed(sweep.directory) == ["0", "1"]
