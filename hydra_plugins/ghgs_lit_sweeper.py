@@ -17,13 +17,15 @@ def rehearse(planned: list[Any]) -> Any:
 class GridSweeper(basic_sweeper.BasicSweeper):
     """Runs every combination of values once, and skips runs that are done."""
 
+    def __init__(self, params: dict[str, str] | None = None) -> None:
+        super().__init__(max_batch_size=None, params=params)
+
     def sweep(self, arguments: list[str]) -> Any:
         from ghgs_lit.runs.sweep import sweep  # Hydra imports its plugins for every application
 
         return sweep(self, arguments, rehearse)
 
 
-# max_batch_size: jobs that a launcher gets at once (null: all); params: comma-separated values by key,
-# as on the command line, which replaces them.
-_NODE = {"_target_": f"{__name__}.GridSweeper", "max_batch_size": None, "params": None}
+# params: comma-separated values by key, as on the command line, which replaces them.
+_NODE = {"_target_": f"{__name__}.GridSweeper", "params": None}
 ConfigStore.instance().store(group="hydra/sweeper", name="grid", node=_NODE, provider="ghgs_lit")

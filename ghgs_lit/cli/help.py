@@ -12,7 +12,7 @@ from pydantic_core import PydanticUndefined
 
 from ghgs_lit.config.compose import compose
 from ghgs_lit.config.folder import conf_dir
-from ghgs_lit.config.options import describe_field, did_you_mean, meanings, options_of
+from ghgs_lit.config.options import describe_field, did_you_mean, options_of
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, kinds_of, verb_class, verbs
 from ghgs_lit.errors import InputError
 
@@ -75,11 +75,10 @@ def print_help(verb: str, groups: Sequence[str], overrides: Sequence[str], folde
 
 def _print_fields(cls: type[BaseModel], values: Mapping[str, Any], indent: str = "") -> None:
     """Print the fields of a class, with the composed values as defaults."""
-    texts = meanings(cls)
     for name, field in cls.model_fields.items():
         nested = options_of(field.annotation)
         default = values.get(name, field.get_default(call_default_factory=True))
-        text = " ".join(texts.get(name, "").split())
+        text = " ".join((field.description or "").split())
         if nested is not None:
             print(f"{indent}{name}: {text}")
             _print_fields(nested, default if isinstance(default, Mapping) else {}, indent + "  ")

@@ -5,12 +5,8 @@ validated whatever their source (YAML, command line, checkpoint, Python); ``ghgs
 prints the fields.
 """
 
-import ast
 import difflib
-import inspect
-import itertools
 import os
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
@@ -55,19 +51,6 @@ def options_of(annotation: Any) -> type[BaseModel] | None:
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             return choice
     return None
-
-
-def meanings(cls: type) -> dict[str, str]:
-    """Text below each field of a class and its bases."""
-    texts: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        if not (issubclass(base, BaseModel) and inspect.get_annotations(base)):
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
-        for field, text in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                texts[field.target.id] = inspect.cleandoc(ast.literal_eval(text.value))
-    return texts
 
 
 def _describe(schema: Mapping[str, Any]) -> str:
@@ -168,6 +151,7 @@ class Options(BaseModel, metaclass=_Checked):
         validate_default=True,
         allow_inf_nan=False,
         arbitrary_types_allowed=True,
+        use_attribute_docstrings=True,
     )
     group: ClassVar[str] = ""
 

@@ -144,14 +144,15 @@ TERMS: dict[str, str] = {
     "silhouette": "ghgs_lit.losses.terms.silhouette",
 }
 
-#: Shipped import paths by group.
-_SHIPPED: dict[str, Mapping[str | None, str]] = {**KINDS, VERB: VERBS, PARTS: {}, TERM: TERMS}
-
 #: Groups of named nodes, such as ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
-#: Classes or import paths registered by plug-ins.
-_REGISTERED: dict[tuple[str, str], type[Options] | str] = {}
+#: Classes or import paths by group and kind; plug-ins add theirs.
+_REGISTERED: dict[tuple[str, str | None], type[Options] | str] = {
+    (group, kind): path
+    for group, kinds in {**KINDS, VERB: VERBS, TERM: TERMS}.items()
+    for kind, path in kinds.items()
+}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
@@ -190,13 +191,11 @@ def offer(group: str, **paths: str) -> None:
 
 
 def _keep(group: str, kind: str, what: type[Options] | str) -> None:
-    if group not in _SHIPPED:
+    if group not in (*KINDS, TERM, VERB, PARTS):
         raise InputError(f"register: expected one of {', '.join([*KINDS, TERM, VERB])}; found {group!r}")
-    known = _SHIPPED[group]
-    before = _REGISTERED.get((group, kind), what)
-    if kind in known or _path_of(before) != _path_of(what):
+    before = _REGISTERED.setdefault((group, kind), what)
+    if _path_of(before) != _path_of(what):
         raise InputError(f"register: expected a new kind of {group}; found {kind!r}")
-    _REGISTERED[group, kind] = what
 
 
 def _path_of(what: type[Options] | str) -> str:
@@ -210,14 +209,17 @@ def import_object(path: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _class_of(what: type[Options] | str) -> type[Options]:
+def _find(group: str, kind: str | None) -> type[Options] | None:
+    """Class of a kind; None if it does not exist."""
+    if (group, kind) not in _REGISTERED:
+        load_plugins()
+    what = _REGISTERED.get((group, kind))
     return import_object(what) if isinstance(what, str) else what
 
 
 def verbs() -> list[str]:
     """Names of all verbs, those of plug-ins last."""
-    load_plugins()
-    return [*VERBS, *(name for group, name in _REGISTERED if group == VERB)]
+    return kinds_of(VERB)
 
 
 def verb_class(name: str) -> type[Options]:
@@ -226,15 +228,13 @@ def verb_class(name: str) -> type[Options]:
     Args:
         name: one of :func:`verbs`.
     """
-    if name not in VERBS:
-        load_plugins()
-    return _class_of(VERBS.get(name) or _REGISTERED[VERB, name])
+    return _find(VERB, name)
 
 
 def kinds_of(group: str) -> list[str | None]:
     """All kinds of a group, including registered ones; None: the group has no kinds."""
     load_plugins()
-    return [*_SHIPPED.get(group, {}), *(kind for of, kind in _REGISTERED if of == group)]
+    return [kind for of, kind in _REGISTERED if of == group]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
@@ -248,19 +248,15 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     Raises:
         InputError: The kind does not exist; the message lists the known ones.
     """
-    known = _SHIPPED[group]
-    if isinstance(kind, str) and kind not in known:
-        load_plugins()
-        if (group, kind) in _REGISTERED:
-            return _class_of(_REGISTERED[group, kind])
-    if not (kind is None or isinstance(kind, str)) or kind not in known:
+    cls = _find(group, kind) if kind is None or isinstance(kind, str) else None
+    if cls is None:
         names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
         raise InputError(
             f"{key}{'.kind' * (group in KINDS)}: expected {expected}; found {format_value(kind)}"
             f"{did_you_mean(kind, names)} ({VARIABLE}=file.py adds kinds of your own)"
         )
-    return _class_of(known[kind])
+    return cls
 
 
 def class_of_node(node: Mapping[str, Any], key: str) -> type[Options]:

@@ -24,19 +24,15 @@ def process_count(trainer: "TrainerOptions") -> int:
     devices = trainer.devices
     if isinstance(devices, tuple):
         count = len(devices)
-    elif devices in ("auto", -1):
-        count = _device_count(trainer.accelerator)
-    else:
+    elif devices not in ("auto", -1):
         count = devices
+    elif trainer.accelerator == "cpu":
+        count = 1
+    else:
+        import torch  # here: planning a sweep does not need PyTorch
+
+        count = max(1, torch.cuda.device_count())
     return count * trainer.num_nodes
-
-
-def _device_count(accelerator: str) -> int:
-    if accelerator == "cpu":
-        return 1
-    import torch  # here: planning a sweep does not need PyTorch
-
-    return max(1, torch.cuda.device_count())
 
 
 def settle_rank(trainer: "TrainerOptions") -> int:

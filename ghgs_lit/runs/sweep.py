@@ -39,15 +39,18 @@ class PlannedRun:
 
     Attributes:
         overrides: Hydra overrides of the job, including those that set its directory.
-        shown: Overrides to print.
         run: Configuration of the run.
         directory: Directory of the run.
     """
 
     overrides: tuple[str, ...]
-    shown: tuple[str, ...]
     run: Run
     directory: RunDirectory
+
+    @property
+    def shown(self) -> list[str]:
+        """Overrides to print, without those of Hydra."""
+        return filter_overrides(self.overrides)
 
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
@@ -81,7 +84,7 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
                 print_plan(planned, directory, rehearse)
                 return []
             write_plan(planned, config, directory)
-            returns = run_all(planned, partial(_launch, sweeper.launcher), sweeper.max_batch_size)
+            returns = run_all(planned, partial(_launch, sweeper.launcher))
     except Interrupted as stop:
         if not stop.explained:  # by the run
             print_how_to_go_on(stop, "the sweep", f"hydra.sweep.dir={directory}")
@@ -116,8 +119,7 @@ def combinations(
 
 def _make_plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[PlannedRun]:
     """Distinct runs of a sweep; writes nothing."""
-    config, batch = sweeper.config, sweeper.max_batch_size
-    require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
+    config = sweeper.config
     verb = verb_class("train")
     loader = sweeper.hydra_context.config_loader
     planned: dict[str, PlannedRun] = {}
@@ -140,7 +142,7 @@ def _make_plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path)
             for key, text in places.items()
         )
         place = RunDirectory(directory / subdirectory, name)
-        item = PlannedRun((*overrides, *fixed), tuple(filter_overrides(overrides)), run, place)
+        item = PlannedRun((*overrides, *fixed), run, place)
         planned.setdefault(name, item)
     if len(grid) > len(planned):
         print(f"{len(grid)} combinations, {len(planned)} different configurations", flush=True)
@@ -219,7 +221,7 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
     write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config) + runs)
 
 
-def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
+def run_all(planned: Sequence[PlannedRun], launch: Launch) -> list[JobReturn]:
     """Launch runs until each has finished, in any process, or failed.
 
     A job that returns ``BUSY`` (its run is locked by another process) is launched again once that process
@@ -228,7 +230,6 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     Args:
         planned: All runs of the sweep; finished runs are not launched.
         launch: Starts jobs, given their overrides and the number of the first.
-        batch: Number of jobs at once, at least 1; None: all.
 
     Returns:
         The jobs' return values, in the order in which they ended.
@@ -238,16 +239,14 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     returns: list[JobReturn] = []
     while todo:
         busy = []
-        size = batch or len(todo)
-        for jobs in (todo[first : first + size] for first in range(0, len(todo), size)):
-            results = launch([item.overrides for item in jobs], len(returns))
-            for item, result in zip(jobs, results, strict=True):
-                if result.status == JobStatus.COMPLETED and result.return_value == BUSY:
-                    busy.append(item)
-                    continue
-                returns.append(result)
-                if result.status == JobStatus.FAILED:
-                    log.error("failed: %s: %s", item.directory.path, result._return_value)
+        results = launch([item.overrides for item in todo], len(returns))
+        for item, result in zip(todo, results, strict=True):
+            if result.status == JobStatus.COMPLETED and result.return_value == BUSY:
+                busy.append(item)
+                continue
+            returns.append(result)
+            if result.status == JobStatus.FAILED:
+                log.error("failed: %s: %s", item.directory.path, result._return_value)
         if todo := busy:
             print(f"waiting for {', '.join(item.directory.owner for item in todo)}", flush=True)
         while todo and all(item.directory.state == "running" for item in todo):

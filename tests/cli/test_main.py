@@ -1,25 +1,21 @@
 """The command line: verbs, one-line errors and exit codes."""
 
-import logging
 import re
 import subprocess
 import sys
-import warnings
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from ghgs_lit.cli import application
 from ghgs_lit.cli.messages import parse_arguments
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.cli.verbs import Train
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.config.registry import verb_class, verbs
 from tests.helpers.processes import run_python
-from tests.helpers.verbs import ghgs
+from tests.helpers.verbs import ghgs, refuse, succeed
 
 
 def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
@@ -32,8 +28,7 @@ def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
 def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, capsys):
     """A verb without a module or configuration would fail only in use; example checkpoints have the paths
     that training writes."""
-    code, out, _ = call(monkeypatch, capsys, "--help")
-    assert code == 0
+    out = succeed(capsys, "--help")
     for verb in verbs():
         assert verb_class(verb).example in out
     checkpoints = re.findall(r"checkpoint=(\S+)", out)
@@ -57,15 +52,13 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "my_people.yaml").write_text("kind: scans\n")
     flags = ("model=paper", "--config-dir", str(tmp_path))
-    code, out, _ = call(monkeypatch, capsys, "train", *flags, "--help")
-    assert code == 0
+    out = succeed(capsys, "train", *flags, "--help")
     assert "the paper's model, or model=hull" in out
     assert "ablation: full*" in out
     assert "encoder: vggt_1b | vggt_nano* | vggt_small" in out
     assert "my_people | " in out
     assert "seed (default 1; an integer >= 0 and <= 4294967295)\n    Seed of the weights" in out
-    code, out, _ = call(monkeypatch, capsys, "train", "model=hull", "--help", "depth_head")
-    assert code == 0
+    out = succeed(capsys, "train", "model=hull", "--help", "depth_head")
     assert "== depth_head: {kind: dpt, ...} ==" in out
     assert "start (default 0.25; a number > 0 and < 1)" in out  # of depth_head=hull
     _, out, _ = call(monkeypatch, capsys, "train", "model=paper", "encoder.width=48", "--help", "encoder")
@@ -73,30 +66,15 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     _, out, _ = call(monkeypatch, capsys, "train", "--help", "ablation")
     assert "== ablation=neither ==" in out
     assert "similarity: none" in out
-    code, _, err = call(monkeypatch, capsys, "train", "--help", "depth_heat")
-    assert code == 1
+    err = refuse(capsys, "train", "--help", "depth_heat")
     assert "found 'depth_heat' (did you mean depth_head?)" in err
 
 
 @pytest.mark.parametrize("verb", verbs())
 def test_help_of_every_verb_names_its_keys(monkeypatch, capsys, verb):
-    code, out, _ = call(monkeypatch, capsys, verb, "--help")
-    assert code == 0
+    out = succeed(capsys, verb, "--help")
     for name in verb_class(verb).model_fields:
         assert re.search(rf"^ *{name}( |\.|:|$)", out, re.MULTILINE), name
-
-
-def test_what_lightning_says_of_itself_is_not_shown():
-    """Lightning's messages appeared twice, and its advice does not apply."""
-    from ghgs_lit.cli.train import silence_lightning
-
-    with warnings.catch_warnings(record=True) as shown:
-        warnings.simplefilter("always")
-        silence_lightning()
-        warnings.warn("'train_dataloader' does not have many workers: increase `num_workers`", stacklevel=1)
-        warnings.warn("Checkpoint directory a exists and is not empty.", stacklevel=1)
-    assert shown == []
-    assert not logging.getLogger("lightning.pytorch.utilities.rank_zero").isEnabledFor(logging.INFO)
 
 
 def test_a_reader_that_closes_the_pipe_gets_no_traceback():
@@ -128,23 +106,6 @@ def test_a_prediction_does_not_wait_for_what_training_needs():
     loaded = set(run_python(code).stdout.split())
     assert {"torch", "ghgs_lit.refinement"} <= loaded
     assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded
-
-
-def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
-    """Lightning starts the other processes of a DDP job with sys.argv, which must contain the verb."""
-    seen = {}
-
-    def run(self):
-        seen["argv"] = list(sys.argv)
-
-    monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
-    monkeypatch.setattr(Train, "run", run)
-    monkeypatch.setattr(application, "check_ablation", lambda cfg, hydra_node: None)
-    node = {"runtime": {"output_dir": "."}, "overrides": {"hydra": []}, "mode": RunMode.RUN}
-    node["job"] = {"name": "train"}
-    monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create(node))
-    application.work(compose("train"), "train", ("ghgs", "train", "seed=1"))
-    assert seen["argv"] == ["ghgs", "train", "seed=1"]
 
 
 def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_path):

@@ -12,8 +12,8 @@ from ghgs_lit.config.defaults import with_defaults
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import Count, Options, Size
 from ghgs_lit.config.registry import KINDS, class_of_node, nodes_of, verb_class, verbs
-from tests.cli.test_main import call
 from tests.helpers.configs import composed, verb_with
+from tests.helpers.verbs import succeed
 
 
 class Inner(Options):
@@ -105,8 +105,7 @@ def test_an_inner_key_leaves_the_others_at_the_default_of_their_field():
 
 
 def test_cfg_prints_all(monkeypatch, capsys):
-    code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job")
-    assert code == 0
+    out = succeed(capsys, "train", "--cfg", "job")
     assert OmegaConf.create(out) == composed("train")
-    code, out, _ = call(monkeypatch, capsys, "table", "--cfg", "job")
+    out = succeed(capsys, "table", "--cfg", "job")
     assert OmegaConf.to_container(OmegaConf.create(out))["runs"] == "???"

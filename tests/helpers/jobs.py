@@ -80,7 +80,7 @@ def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
     for seed in range(count):
         run = base.replace(seed=seed)
         name = config_hash(run.plain)
-        planned.append(PlannedRun((str(seed),), (), run, RunDirectory(sweep / name, name)))
+        planned.append(PlannedRun((str(seed),), run, RunDirectory(sweep / name, name)))
     return planned
 
 

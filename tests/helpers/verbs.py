@@ -4,6 +4,8 @@ import logging
 import os
 import sys
 
+from hydra.core.global_hydra import GlobalHydra
+
 from ghgs_lit.cli.main import main
 
 
@@ -24,3 +26,21 @@ def ghgs(*arguments: str) -> int:
             if isinstance(handler, logging.FileHandler):
                 logging.getLogger().removeHandler(handler)
                 handler.close()
+
+
+def succeed(capsys, *arguments: str) -> str:
+    """Standard output of ``ghgs <arguments>``, which must succeed."""
+    GlobalHydra.instance().clear()
+    code = ghgs(*arguments)
+    out, err = capsys.readouterr()
+    assert not code, err
+    return out
+
+
+def refuse(capsys, *arguments: str) -> str:
+    """Error of ``ghgs <arguments>``, which must be one line with exit code 1."""
+    GlobalHydra.instance().clear()
+    code = ghgs(*arguments)
+    err = capsys.readouterr().err
+    assert (code, err.count("\n")) == (1, 1), err
+    return err

@@ -5,6 +5,7 @@ import pytest
 from ghgs_lit.cli import train as train_verb
 from tests.cli.test_main import call
 from tests.helpers.jobs import record_execution, rehearse_nothing
+from tests.helpers.verbs import refuse, succeed
 
 
 @pytest.fixture
@@ -21,6 +22,9 @@ def sweep(monkeypatch, capsys, tmp_path):
         return call(monkeypatch, capsys, "train", "-m", f"hydra.sweep.dir={tmp_path / 'sweep'}", *overrides)
 
     run.directory = tmp_path / "sweep"
+    there = f"hydra.sweep.dir={run.directory}"
+    run.succeed = lambda *overrides: succeed(capsys, "train", "-m", there, *overrides)
+    run.refuse = lambda *overrides: refuse(capsys, "train", "-m", there, *overrides)
     return run
 
 
@@ -28,4 +32,9 @@ def sweep(monkeypatch, capsys, tmp_path):
 def verb(monkeypatch, capsys):
     """``verb("seed=1")`` runs ``ghgs train`` without training."""
     monkeypatch.setattr(train_verb, "train", record_execution)
-    return lambda *overrides: call(monkeypatch, capsys, "train", *overrides)
+
+    def run(*overrides: str):
+        return call(monkeypatch, capsys, "train", *overrides)
+
+    run.refuse = lambda *overrides: refuse(capsys, "train", *overrides)
+    return run

@@ -42,8 +42,7 @@ def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monke
     _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
     assert "4 runs: 1 done, 2 missing, 1 partial" in out
     monkeypatch.setattr(train_verb, "train", record_execution)
-    code, out, _ = sweep("seed=1,2,3,4")
-    assert code == 0
+    out = sweep.succeed("seed=1,2,3,4")
     assert "4 runs: 4 done" in out
     lines = [line.split() for line in (sweep.directory / "executed").read_text().splitlines()]
     resumed = {name: resume for name, _, resume in lines}
@@ -71,8 +70,7 @@ def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, numbe
     (line,) = [line for line in err.splitlines() if "to go on" in line]
     assert f"hydra.sweep.dir={sweep.directory}" in line
     monkeypatch.setattr(train_verb, "train", record_execution)
-    code, out, _ = sweep("seed=1,2,3")
-    assert code == 0
+    out = sweep.succeed("seed=1,2,3")
     assert "3 runs: 3 done" in out
 
 

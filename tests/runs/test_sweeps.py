@@ -24,6 +24,7 @@ from tests.helpers.jobs import (
     work_through,
 )
 from tests.helpers.processes import PREPARED
+from tests.helpers.verbs import succeed
 
 pytestmark = pytest.mark.usefixtures("plans_alone")
 
@@ -32,12 +33,11 @@ def test_a_grid_that_grows_runs_what_is_missing(sweep):
     """A larger grid does not repeat finished runs; keys without influence create no new runs."""
     code, out, _ = sweep("seed=1,2")
     assert (code, len(executed(sweep.directory))) == (0, 2)
-    code, out, _ = sweep("seed=1,2,3")
-    assert code == 0
+    out = sweep.succeed("seed=1,2,3")
     assert "3 runs: 2 done before, 1 to do" in out
     names = executed(sweep.directory)
     assert len(names) == len(set(names)) == 3
-    sweep("seed=2,3", "logger=none", "data.workers=1", "hydra.sweeper.max_batch_size=1")
+    sweep("seed=2,3", "logger=none", "data.workers=1")
     assert executed(sweep.directory) == names  # keys without influence create no new run
     for name in names:
         source = read_results(sweep.directory / name / "metrics.json")["provenance"]
@@ -76,8 +76,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_by_the_plan(sweep, monkey
 
 def test_two_runs_in_one_directory_are_refused_before_any_is_trained(sweep):
     for dry in ("dry_run=true", "dry_run=false"):
-        code, _, err = sweep("hydra.sweep.subdir=same", "seed=1,2", dry)
-        assert code == 1
+        err = sweep.refuse("hydra.sweep.subdir=same", "seed=1,2", dry)
         assert "hydra.sweep.subdir: expected a directory for each configuration; found" in err
     assert not sweep.directory.exists()
 
@@ -92,13 +91,12 @@ def test_directories_may_say_what_sets_them_apart(sweep):
 
 
 def test_dry_run_runs_nothing_and_prints_states(sweep):
-    code, out, _ = sweep("seed=1,2", "dry_run=true", "trainer.max_steps=100")
-    assert code == 0
+    out = sweep.succeed("seed=1,2", "dry_run=true", "trainer.max_steps=100")
     assert not sweep.directory.exists()
     assert "2 runs: 2 missing\nnothing was run" in out
     sweep("seed=1", "trainer.max_steps=100")
     names = executed(sweep.directory)
-    code, out, _ = sweep("seed=1,2,3", "dry_run=true", "trainer.max_steps=100")
+    out = sweep.succeed("seed=1,2,3", "dry_run=true", "trainer.max_steps=100")
     assert executed(sweep.directory) == names
     assert re.search(rf"{names[0]} +done +100 +20\.\d\d +seed=1\n", out)
     assert "3 runs: 1 done, 2 missing" in out
@@ -151,11 +149,9 @@ def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
 
 def test_an_impossible_job_fails_before_any_is_launched(sweep):
     """An invalid value is found before hours of training."""
-    code, _, err = sweep("seed=1,-2")
-    assert code == 1
+    err = sweep.refuse("seed=1,-2")
     assert "seed: expected an integer >= 0" in err
-    code, _, err = sweep("seed=1,2", "trainer.devices=2", "dry_run=true")
-    assert code == 1
+    err = sweep.refuse("seed=1,2", "trainer.devices=2", "dry_run=true")
     assert "trainer.devices: expected 1 in a sweep, or hydra/launcher=slurm" in err
     assert not executed(sweep.directory)
 
@@ -255,8 +251,7 @@ def test_named_sweeps(name, count, data):
 def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
     """Without its own mode, ``sweep=table4`` would train a single run."""
     there = f"hydra.sweep.dir={tmp_path}"
-    code, out, _ = call(monkeypatch, capsys, "train", "sweep=table4", "seed=1", "dry_run=true", there)
-    assert code == 0
+    out = succeed(capsys, "train", "sweep=table4", "seed=1", "dry_run=true", there)
     assert "4 runs: 4 missing" in out
 
 
@@ -274,8 +269,7 @@ def test_tables_share_runs_and_take_other_data(sweep):
     """A run shared by two tables has one hash; other data on the command line changes the hash."""
 
     def names(*overrides):
-        code, out, err = sweep("dry_run=true", "seed=1", *overrides)
-        assert code == 0, err
+        out = sweep.succeed("dry_run=true", "seed=1", *overrides)
         return {word for word in out.split() if len(word) == 12 and set(word) <= set("0123456789abcdef")}
 
     table2, table4 = names("sweep=table2"), names("sweep=table4")
