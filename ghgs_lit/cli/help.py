@@ -11,8 +11,8 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from ghgs_lit.config.compose import compose
-from ghgs_lit.config.folder import conf_dir
-from ghgs_lit.config.options import describe_field, did_you_mean, options_of
+from ghgs_lit.config.options import describe_field, did_you_mean, meaning_of, options_of
+from ghgs_lit.config.reading import conf_dir
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, kinds_of, verb_class, verbs
 from ghgs_lit.errors import InputError
 
@@ -78,7 +78,7 @@ def _print_fields(cls: type[BaseModel], values: Mapping[str, Any], indent: str =
     for name, field in cls.model_fields.items():
         nested = options_of(field.annotation)
         default = values.get(name, field.get_default(call_default_factory=True))
-        text = " ".join((field.description or "").split())
+        text = " ".join(meaning_of(cls, name).split())
         if nested is not None:
             print(f"{indent}{name}: {text}")
             _print_fields(nested, default if isinstance(default, Mapping) else {}, indent + "  ")

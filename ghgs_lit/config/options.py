@@ -53,6 +53,12 @@ def options_of(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
+def meaning_of(cls: type[BaseModel], name: str) -> str:
+    """Text below a field of a class, or below the field of a base that it overrides."""
+    bases = [base for base in cls.__mro__ if name in getattr(base, "model_fields", ())]
+    return next((text for base in bases if (text := base.model_fields[name].description)), "")
+
+
 def _describe(schema: Mapping[str, Any]) -> str:
     """Words for a JSON schema."""
     if "anyOf" in schema:

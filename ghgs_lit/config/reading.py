@@ -1,4 +1,4 @@
-"""Read files for Hydra, and restrict what external files may set.
+"""Find and read files for Hydra, and restrict what external files may set.
 
 External files are those of ``--config-dir`` and ``hydra.searchpath``, which may be untrusted. Their keys
 of the package's groups are options and validated as such. The node ``hydra``, however, can set
@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import hydra
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
@@ -21,11 +22,30 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.defaults import open_nodes, verb_values
-from ghgs_lit.config.folder import conf_dir
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import check_yaml, read_parsed
+
+#: Hydra 1.3 requires the version to be compatible with; later versions do not accept it.
+VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
+
+
+def conf_dir() -> Path:
+    """Absolute path of ``conf``: inside the package in a wheel, next to it in a checkout.
+
+    Raises:
+        InputError: Neither folder exists.
+    """
+    package = Path(__file__).resolve().parents[1]
+    candidates = (package / "conf", package.parent / "conf")
+    for candidate in candidates:
+        if (candidate / "train.yaml").is_file():
+            return candidate
+    raise InputError(
+        f"configuration: expected train.yaml in one of {', '.join(map(str, candidates))}; found none"
+    )
+
 
 #: Keys below ``hydra`` that an external file may set.
 SETTABLE = ("mode", "run.dir", "sweep.dir", "sweep.subdir", "job.name", "sweeper.params")

@@ -15,7 +15,6 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.errors import import_optional
 from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
-from ghgs_lit.runs.job import find_curves
 from ghgs_lit.runs.run import RunDirectory
 
 #: Metrics by which runs are compared; ``metrics.json`` contains all.
@@ -107,7 +106,7 @@ class TensorBoardOptions(Options):
 
     def build(self, save_dir: str) -> TensorBoardLog:
         """Create the logger of the run in ``save_dir``."""
-        return TensorBoardLog(find_curves(Path(save_dir)), name="", version="")
+        return TensorBoardLog(save_dir, name="tensorboard", version="")
 
 
 class WandbLog(WandbLogger):

@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from ghgs_lit.cli.messages import parse_arguments
+from ghgs_lit.cli.application import parse_arguments
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.cli.verbs import Train
 from ghgs_lit.config import compose, run_of

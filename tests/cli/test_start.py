@@ -1,6 +1,5 @@
 """Start and end of commands: imports that they avoid, and what still happens at exit."""
 
-import gc
 import os
 import signal
 import sys
@@ -118,13 +117,3 @@ def test_files_that_a_plug_in_leaves_open_are_whole(tmp_path):
     code = _ENDING.format(verb="train", override="unprojection.kind=mine", fails=False, folder=tmp_path)
     assert run_python(code, GHGS_PLUGINS=str(plugin)).stdout == "said hook\n"
     assert path.read_text() == "flushed"
-
-
-def test_garbage_is_collected_after_a_command(monkeypatch, capsys):
-    """Also in a process that continues."""
-    monkeypatch.setattr(sys, "argv", ["ghgs", "--help"])
-    assert main() == 0
-    frozen = gc.get_freeze_count()
-    assert main() == 0
-    assert gc.isenabled()
-    assert gc.get_freeze_count() <= frozen  # frozen objects may be freed, but none are added

@@ -3,15 +3,13 @@
 import json
 
 import pytest
-import yaml
 from omegaconf import OmegaConf
 from pydantic import Field
 
-from ghgs_lit.config import compose, conf_dir, run_of
+from ghgs_lit.config import compose, run_of
 from ghgs_lit.config.defaults import with_defaults
-from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import Count, Options, Size
-from ghgs_lit.config.registry import KINDS, class_of_node, nodes_of, verb_class, verbs
+from ghgs_lit.config.registry import KINDS, class_of_node, nodes_of
 from tests.helpers.configs import composed, verb_with
 from tests.helpers.verbs import succeed
 
@@ -39,34 +37,6 @@ def test_what_is_not_said_is_the_default():
     assert list(with_defaults({"must": 1}, Outer)) == ["must", "size", "inner", "maybe", "shares"]
     read = Outer.read({"must": 1, "inner": {"sizes": [3]}, "maybe": {}, "shares": {"b": 1.0}}, "x")
     assert json.loads(read.model_dump_json()) == {"must": 1, "size": [140, 140], **nested}
-
-
-def find_restated(values, defaults, path):
-    said = flatten(defaults)
-    return [f"{path}: {key}" for key, value in flatten(values).items() if key in said and said[key] == value]
-
-
-@pytest.mark.parametrize("group", sorted(KINDS.keys() - {"model", "compat", "rounds"}))
-def test_no_option_restates_a_default(group):
-    """Values stated twice would diverge some day; the exceptions are referred to by other keys."""
-    wrong = []
-    for path in sorted((conf_dir() / group).glob("*.yaml")):
-        content = yaml.safe_load(path.read_text()) or {}
-        bases = [name for name in content.pop("defaults", []) if isinstance(name, str) and name != "_self_"]
-        if bases:  # an option derived from another one may reset a key
-            continue
-        for key, node in nodes_of({group: content}):
-            if "kind" in node or None in KINDS[group]:
-                wrong += find_restated(node, with_defaults({}, class_of_node(node, key)), path.stem)
-    referred = ("synthetic: size", "random: evaluation_count")
-    assert [key for key in wrong if key not in referred and not key.endswith(": name")] == []
-
-
-@pytest.mark.parametrize("verb", [verb for verb in verbs() if (conf_dir() / f"{verb}.yaml").is_file()])
-def test_no_verb_restates_a_default(verb):
-    content = yaml.safe_load((conf_dir() / f"{verb}.yaml").read_text())
-    own = {name: value for name, value in content.items() if name in verb_class(verb).model_fields}
-    assert find_restated(own, with_defaults({}, verb_class(verb)), verb) == []
 
 
 @pytest.mark.parametrize("group", sorted(KINDS))

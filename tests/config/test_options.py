@@ -1,59 +1,19 @@
 """YAML files and options agree: no key without a field, no field that no shipped file sets."""
 
-import functools
 import re
 from pathlib import Path
-from typing import get_origin
 
 import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from ghgs_lit.config import conf_dir, run_of
-from ghgs_lit.config.keys import flatten
-from ghgs_lit.config.options import describe_field, options_of
+from ghgs_lit.config import run_of
+from ghgs_lit.config.options import describe_field, meaning_of, options_of
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_nodes, verb_class, verbs
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed, verb_with
 
 TYPED = [(group, kind) for group, kinds in KINDS.items() for kind in kinds]
-
-
-@functools.cache
-def shipped_nodes(group):
-    """Nodes of a group in all shipped configurations, as plain data."""
-    files = sorted((conf_dir() / group).glob("*.yaml"))
-    configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
-    configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent", "pixel")]
-    configurations += [composed("train", *over) for over in (["compat=release"], ["feature_cache.kind=disk"])]
-    configurations += [composed("train", "experiment=shipped")]
-    configurations += [composed(verb) for verb in verbs()]
-    nodes = []
-    for cfg in configurations:
-        if (node := cfg.get(group)) is not None:
-            node = OmegaConf.to_container(node, resolve=False)
-            nodes += node.values() if group in NAMED else [node]
-    return nodes
-
-
-def fields(cls, prefix=""):
-    for name, field in cls.model_fields.items():
-        # Files set lists of options as whole values.
-        nested = None if get_origin(field.annotation) is tuple else options_of(field.annotation)
-        yield f"{prefix}{name}"
-        if nested is not None:
-            yield from fields(nested, f"{prefix}{name}.")
-
-
-def test_every_field_is_set_by_a_shipped_file():
-    """A field that no file sets is a constant, or a key that nobody finds."""
-    missing = []
-    for group, kind in TYPED:
-        nodes = [node for node in shipped_nodes(group) if kind is None or node.get("kind") == kind]
-        keys = {key for node in nodes for key in flatten(node)}
-        keys |= {key[:end] for key in keys for end, sign in enumerate(key) if sign == "."}
-        missing += [(group, kind, name) for name in fields(class_of(group, kind, group)) if name not in keys]
-    assert missing == []
 
 
 def nested_classes(cls):
@@ -69,7 +29,7 @@ def test_every_field_has_a_meaning():
         verb_class(verb) for verb in verbs()
     ]:
         for each in nested_classes(cls):
-            assert all(field.description for field in each.model_fields.values()), each
+            assert all(meaning_of(each, name) for name in each.model_fields), each
 
 
 #: Required keys.

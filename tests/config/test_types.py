@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field, model_validator
 
 from ghgs_lit.config.nodes import Texts
-from ghgs_lit.config.options import Count, Options, PathText, Share, Size, Text, Width
+from ghgs_lit.config.options import Count, Options, PathText, Share, Size, Text, Width, meaning_of
 from ghgs_lit.errors import InputError
 
 
@@ -94,7 +94,7 @@ def test_lists_and_integers_are_taken_and_nothing_changes_afterwards():
 
 
 def test_meanings_are_the_texts_below_the_fields():
-    assert Outer.model_fields["start"].description == "Share of the way\nat the start."
+    assert meaning_of(Outer, "start") == "Share of the way\nat the start."
 
 
 class _Person(Options):
