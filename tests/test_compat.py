@@ -59,6 +59,5 @@ def test_the_releases_protocol_of_measuring_comes_with_it(verb):
     cfg = OmegaConf.to_container(compose(verb, ["compat=release"]))
     chosen = OmegaConf.to_container(compose(verb, ["compat=release", "metrics=correct"]))
     assert cfg["metrics"]["protocol"] == "release"
-    assert cfg["metrics"]["regions"] == ["image"]
     assert cfg["metrics"]["lpips"] == "require"  # required to compare with the paper
     assert chosen["metrics"]["protocol"] == "correct"

@@ -149,7 +149,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
     """The model, with refinement, and all baselines, with all metrics and pictures: same rows as on the
     CPU."""
     monkeypatch.setattr("ghgs_lit.refinement.cameras._STEPS", 3)
-    metrics = MetricsOptions(regions=("image", "box", "subject", "edge"), lpips="off").build()
+    metrics = MetricsOptions(lpips="off").build()
 
     def rows(device):
         def build():

@@ -1,6 +1,5 @@
 """``ghgs evaluate``: evaluate a checkpoint, baselines, or both on the same targets."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
@@ -11,10 +10,7 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
-from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.execution import Predictor
-from ghgs_lit.method.model import GHGS
+from ghgs_lit.evaluation.report import check_evaluation, measure_and_write
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -52,26 +48,6 @@ def trained_method(run: "Evaluate", device: torch.device) -> tuple[ModelMethod, 
     return ModelMethod(predictor, renderer, refinement, cameras), facts
 
 
-def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.device) -> dict[str, Method]:
-    """Baselines by name.
-
-    Args:
-        names: One name, several names, or ``all``.
-        run: Run with a model, for the baseline ``untrained``.
-        device: Device on which they run.
-
-    Raises:
-        InputError: There is no such baseline, or the renderer does not run on ``device``.
-    """
-    names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
-    renderer = inputs.build_renderer(run, device)
-
-    def untrained() -> Predictor:
-        return Predictor(GHGS.from_config(run.plain).to(device).eval())
-
-    return {name: baseline(name, renderer, untrained, run.per_scene.steps) for name in names}
-
-
 def run(verb: "Evaluate") -> None:
     """Evaluate a checkpoint, baselines or both, and write the results.
 
@@ -92,10 +68,12 @@ def run(verb: "Evaluate") -> None:
     if verb.checkpoint is not None:
         methods["model"], model_facts = trained_method(verb, device)
         facts |= model_facts
-    methods |= baselines_of(verb.baselines, verb, device)
+    names = [verb.baselines] if isinstance(verb.baselines, str) else verb.baselines
+    renderer = inputs.build_renderer(verb, device)
+    for name in BASELINES if names == ["all"] else names:
+        methods[name] = baseline(name, renderer, verb.per_scene.steps)
     data = inputs.build_data(verb)
-    for method in methods.values():
-        if isinstance(method, ModelMethod):
-            inputs.check_size(data, method.predict)
+    if verb.checkpoint is not None:
+        inputs.check_size(data, methods["model"].predict)
     check_evaluation(verb, data)
     announce(measure_and_write(methods, data, verb, directory, device, **facts))

@@ -13,7 +13,7 @@ from ghgs_lit.cli.train import build_trainer, silence_lightning
 from ghgs_lit.config.run import Run
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.protocols import check_evaluation
+from ghgs_lit.evaluation.report import check_evaluation
 from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job

@@ -20,8 +20,7 @@ from ghgs_lit.config.compose import chosen_options, saved_text
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
-from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.evaluation.report import format_means, measure_and_write
+from ghgs_lit.evaluation.report import check_evaluation, format_means, measure_and_write
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.processes import Interrupted, in_srun, interruptible, print_how_to_go_on, settle_rank

@@ -68,8 +68,7 @@ class Evaluate(Measured):
     refine: int = Field(0, ge=0, le=10000)
     """Optimization steps towards the input views after each prediction; 0: none."""
     baselines: Texts = ()
-    """Baselines, from black, nearest_view, hull, photo_depth, true_depth, per_scene,
-    untrained; or all."""
+    """Baselines, from nearest_view, hull, photo_depth, true_depth and per_scene; or all."""
     per_scene: PerScene = PerScene()
     """3D Gaussian splatting optimized on each subject's input views."""
 

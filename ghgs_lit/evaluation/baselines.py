@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, require_choice
-from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
+from ghgs_lit.evaluation.measure import Estimate, Method, Renderer
 from ghgs_lit.geometry.masks import coverage, surface_colors, with_matte
 from ghgs_lit.geometry.projection import focal_lengths, unproject_maps
 from ghgs_lit.geometry.rotations import rotate
@@ -16,7 +16,7 @@ from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.ops.activation import surface_axes
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.refinement import Change, Refinement
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians
 
 #: Finer and tighter than a model's bounds, which must contain the subject despite bad masks.
 HULL = VisualHull(dilation=0.005, samples=192)
@@ -207,16 +207,13 @@ CHANGES = {
     "opacities": Change(limit=7.0, rate=0.1),
     "colors": Change(limit=0.05, rate=0.001),
 }
-#: Initial Gaussians of ``per_scene``: standard deviation in pixels; opacity.
-SIGMA = 0.5
-OPACITY = 0.5
 
 
 def start_scene(batch: Batch) -> Gaussians:
     """Initial Gaussians of ``per_scene``: isotropic ones for each pixel of the subject, at
     :func:`photo_depth`."""
     depth = photo_depth(batch)
-    return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
+    return splats_at(batch, depth, depth > 0, sigma=0.5, opacity=0.5)
 
 
 def per_scene(batch: Batch, renderer: Renderer, steps: int) -> Estimate:
@@ -232,18 +229,6 @@ def per_scene(batch: Batch, renderer: Renderer, steps: int) -> Estimate:
     """
     gaussians = Refinement(steps, renderer, CHANGES)(start_scene(batch), batch)
     return Estimate(renderer(gaussians, batch.targets.cameras).image, gaussians=gaussians)
-
-
-def black(batch: Batch) -> Estimate:
-    """Predict black images, which score the background alone.
-
-    Args:
-        batch: With T targets of h x w pixels.
-
-    Returns:
-        Zeros [B, T, 3, h, w].
-    """
-    return Estimate(torch.zeros_like(batch.targets.images))
 
 
 def nearest_view(batch: Batch) -> Estimate:
@@ -273,31 +258,23 @@ DEPTH_OF = {
     "photo_depth": photo_depth,
     "true_depth": true_depth,
 }
-BASELINES = ("black", "nearest_view", *DEPTH_OF, "per_scene", "untrained")
+BASELINES = ("nearest_view", *DEPTH_OF, "per_scene")
 
 
-def baseline(
-    name: str,
-    renderer: Renderer,
-    untrained: Callable[[], Callable[[Batch], Prediction]],
-    steps: int,
-) -> Method:
+def baseline(name: str, renderer: Renderer, steps: int) -> Method:
     """Build a baseline.
 
     Args:
         name: One of ``BASELINES``.
         renderer: Renders Gaussians from the target cameras.
-        untrained: Builds a predictor with random weights, for ``untrained``.
         steps: Steps of the optimiser of ``per_scene``, at least 1.
 
     Raises:
         InputError: There is no such baseline.
     """
     require_choice("baselines", name, BASELINES)
-    if name in DEPTH_OF:
-        return partial(render_discs, depth_of=DEPTH_OF[name], renderer=renderer)
     if name == "per_scene":
         return partial(per_scene, renderer=renderer, steps=steps)
-    if name == "untrained":
-        return ModelMethod(untrained(), renderer)
-    return {"black": black, "nearest_view": nearest_view}[name]
+    if name == "nearest_view":
+        return nearest_view
+    return partial(render_discs, depth_of=DEPTH_OF[name], renderer=renderer)

@@ -13,7 +13,6 @@ from lightning.pytorch import LightningDataModule
 from rich.progress import track
 from torch import Tensor
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.method.recalibration.inspection import Call, collect_calls, shared_neighbors
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
@@ -186,15 +185,10 @@ def measure(
     Returns:
         Rows with method, subject, views and target, the metrics, and ``seconds``: time of the
         prediction and all renders of a batch, divided by the number of its subjects.
-
-    Raises:
-        InputError: A batch has no targets.
     """
     rows: list[Row] = []
     for batch in loader:
         batch = batch.to(device)
-        if batch.targets is None:
-            raise InputError("targets: expected target photographs; found none")
         started = time.perf_counter()
         estimate = method(batch)
         if estimate.image.is_cuda:
@@ -234,9 +228,6 @@ def measure_all(
 
     Returns:
         Rows as in :func:`measure`, by number of views, then protocol, then method.
-
-    Raises:
-        InputError: A batch has no targets.
     """
     rows: list[Row] = []
     for count in views:

@@ -10,13 +10,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import require, require_choice
+from ghgs_lit.errors import require
 from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.regions import box_of, grown, mean_over
 
-PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
 """Largest PSNR in dB, that of equal images: float32 does not resolve smaller errors."""
 BESIDE = 3
@@ -120,9 +119,7 @@ def ssim_map(
         The similarity of each window in [-1, 1].
 
     Raises:
-        InputError: the images are smaller than the window and not padded with zeros, or ``padding``
-            is unknown."""
-    require_choice("ssim.padding", padding, PADDINGS)
+        InputError: the images are smaller than the window and not padded with zeros."""
     found = tuple(image.shape[-2:])
     large = padding == "zeros" or min(found) >= SSIM_WINDOW
     expected = f"images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, or padding zeros"
@@ -226,12 +223,8 @@ def depth_error_mm(
         region: pixels to average over.
 
     Returns:
-        Millimetres; nan without such pixels.
-
-    Raises:
-        InputError: the depths differ in shape."""
+        Millimetres; nan without such pixels."""
     region = region & (truth > 0)
-    require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()
 
 

@@ -1,8 +1,8 @@
 """Measuring protocols: which metrics are computed, how, and under which names."""
 
 import warnings
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,11 +21,16 @@ from ghgs_lit.metrics.functional import (
 )
 from ghgs_lit.metrics.regions import mean_over, region_of
 
-_ALL = ("psnr", "ssim", "flip")
-#: Metrics of each region; SSIM and FLIP use windows, which thin regions do not fill.
-MEASURED = {"image": _ALL, "box": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
-#: Further metrics, and the region that enables each.
-FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
+#: Metrics that do not average a map over a region.
+FURTHER = {"psnr_box_40": psnr_box_40, "spill": spill, "sharpness": sharpness}
+#: Metrics of each protocol; SSIM and FLIP use windows, which thin regions do not fill.
+MEASURED = {
+    "release": ("psnr", "ssim", "flip"),
+    "correct": (
+        "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
+        "psnr_edge", *FURTHER,
+    ),
+}  # fmt: skip
 
 
 class LPIPS:
@@ -75,12 +80,9 @@ class MetricsOptions(Options):
     group = "metrics"
     protocol: Literal["correct", "release"] = "correct"
     """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it
-    was calibrated. release: as the authors' code: no clamp, SSIM padded with zeros, LPIPS on [0, 1].
-    Reported with every number."""
-    regions: tuple[Literal["image", "box", "subject", "edge"], ...] = ("image", "box", "subject", "edge")
-    """Regions in which PSNR, SSIM and FLIP are measured. image: all pixels; box: the mask's bounding
-    box (also PSNR at a common brightness); subject: the mask's pixels (without FLIP); edge: the mask's
-    outline and edges of true depth (PSNR alone; also light outside the subject and sharpness inside)."""
+    was calibrated; whole images, the mask's bounding box, its pixels and its edges. release: as the
+    authors' code: no clamp, SSIM padded with zeros, LPIPS on [0, 1]; whole images. Reported with every
+    number."""
     lpips: Literal["auto", "require", "off"] = "auto"
     """auto: skipped with a message if torchvision or its weights are missing; require: an error if they
     are; off: never computed."""
@@ -101,9 +103,8 @@ class MetricsOptions(Options):
 class ImageMetrics:
     """All metrics of a protocol.
 
-    Names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with the suffix ``_box``,
-    ``_subject`` or ``_edge`` for other regions (see :data:`MEASURED`; LPIPS for the whole
-    image only), and those of :data:`FURTHER`.
+    Names are those in :data:`MEASURED`, with the suffix ``_box``, ``_subject`` or ``_edge`` for other regions
+    than the whole image, and ``lpips``.
 
     Attributes:
         protocol: name of the protocol, reported with every number.
@@ -140,21 +141,12 @@ class ImageMetrics:
     @property
     def names(self) -> list[str]:
         """Names of the values returned by a call, in order."""
-        return [*self._of_protocol, *self._beside(dict.fromkeys(self.beside.names if self.beside else ()))]
-
-    def _beside(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        return {f"{name}_{self.options.beside}": value for name, value in values.items()}
+        beside = self.beside.names if self.beside else []
+        return [*self._of_protocol, *(f"{name}_{self.options.beside}" for name in beside)]
 
     @property
     def _of_protocol(self) -> list[str]:
-        names = []
-        for region in self.options.regions:
-            for metric in MEASURED[region]:
-                names.append(metric if region == "image" else f"{metric}_{region}")
-        names += [name for name, (region, _) in FURTHER.items() if region in self.options.regions]
-        if self.lpips is not None:
-            names.append("lpips")
-        return names
+        return [*MEASURED[self.protocol], *["lpips"] * (self.lpips is not None)]
 
     def __call__(
         self,
@@ -175,7 +167,8 @@ class ImageMetrics:
             One value per image for each of :attr:`names`; nan if a region is empty."""
         values = self.measure(image, target, mask, self._of_protocol, depth)
         if self.beside is not None:
-            values |= self._beside(self.beside(image, target, mask, depth))
+            for name, value in self.beside(image, target, mask, depth).items():
+                values[f"{name}_{self.options.beside}"] = value
         return values
 
     @torch.no_grad()
@@ -191,7 +184,7 @@ class ImageMetrics:
 
         Args:
             image, target, mask, depth: as in a call.
-            names: names of metrics (:data:`MEASURED` with a region, :data:`FURTHER`, ``lpips``).
+            names: names of metrics (:data:`MEASURED` of any protocol, or ``lpips``).
 
         Returns:
             One value per image for each name."""
@@ -205,8 +198,7 @@ class ImageMetrics:
                 values[name] = self.lpips(image, target)
                 continue
             if name in FURTHER:
-                _, further = FURTHER[name]
-                values[name] = further(image, target, mask)
+                values[name] = FURTHER[name](image, target, mask)
                 continue
             metric, _, region = name.partition("_")
             if metric not in maps:

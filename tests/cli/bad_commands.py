@@ -242,7 +242,7 @@ EARLY = [
     ("train evaluation.split=foo", 1, "evaluation.split: expected", "'foo'"),
     ("train data.size=150", 1, "data.size: expected sides divisible by the patch size 14 (or", "150"),
     (
-        "evaluate data=synthetic baselines=[untrained] data.size=[140,150] device=cpu",
+        "evaluate checkpoint={ckpt} data=synthetic data.size=[140,150] device=cpu",
         1,
         "data.size: expected sides divisible by the patch size 14 (or model.pad=multiple); found [140, 150]",
     ),

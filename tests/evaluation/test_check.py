@@ -8,7 +8,7 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.protocols import check_evaluation
+from ghgs_lit.evaluation.report import check_evaluation
 
 
 def check(root, *overrides):

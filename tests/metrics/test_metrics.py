@@ -17,7 +17,7 @@ from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-RELEASE = MetricsOptions(protocol="release", regions=("image",), lpips="off")
+RELEASE = MetricsOptions(protocol="release", lpips="off")
 
 
 def _images(n=3, h=30, w=41, seed=0):
@@ -156,7 +156,7 @@ def test_two_protocols_are_measured_side_by_side():
     images = torch.rand(2, 2, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 1.2
     mask = torch.zeros(2, 24, 24, dtype=torch.bool)
     mask[:, 4:20, 6:18] = True
-    options = {"protocol": "release", "regions": ("image",), "lpips": "off"}
+    options = {"protocol": "release", "lpips": "off"}
     both = MetricsOptions(**options, beside="correct").build()
     values = both(*images, mask)
     assert list(values) == both.names

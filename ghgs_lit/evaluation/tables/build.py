@@ -14,13 +14,11 @@ from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Group, Layout, Line, Tab
 from ghgs_lit.evaluation.tables.runs import OF_TRAINING_TARGETS, SETTING, Sweep, Variant
 
 BASELINES = {
-    "black": "Black image",
     "nearest_view": "Nearest input view",
     "hull": "Discs on the visual hull",
     "photo_depth": "Discs at the photo-consistent depth",
     "per_scene": "Per-scene 3DGS",
     "true_depth": "Discs at the true depth",
-    "untrained": "Untrained model",
 }
 #: Titles of models that are modelled on other methods.
 PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}

@@ -38,8 +38,6 @@ COLUMNS = (
     "subjects", "best", "test_seeds", "test_subjects", "test_difference", "test_low", "test_high", "test_p",
     "test_p_holm", "test_smallest", "runs",
 )  # fmt: skip
-NO_FIGURE = "-"
-"""Text of a cell without a number, as in the paper."""
 
 
 def write_caption(table: Table) -> str:
@@ -145,7 +143,7 @@ def _describe_test(table: Table) -> list[str]:
 def _format_cell(cell: Any) -> str:
     """Format a cell: number, deviation over seeds, mark, interval of its difference, missing seeds."""
     if pd.isna(cell.mean):
-        return "missing" if cell.lacking else NO_FIGURE
+        return "missing" if cell.lacking else "-"
     digits = metric_of(cell.Index[2]).decimals
     text = f"{cell.mean:.{digits}f}"
     if cell.best:
