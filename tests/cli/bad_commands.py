@@ -183,7 +183,7 @@ NAMES = [
     ("train loss.weights.render_l2=1", 1, "loss.weights.render_l2: expected one of", "mean render_l1?"),
     ("train trainer.accelerator=abacus", 1, "trainer", "abacus"),
     ("train data.kind=os.system", 1, "data.kind: expected one of humman", "'os.system'"),
-    ("evaluate data=synthetic baselines=[white]", 1, "baselines: expected one of black", "'white'"),
+    ("evaluate data=synthetic baselines=[white]", 1, "baselines: expected one of nearest_view", "'white'"),
     ("evaluate checkpoint={ckpt} data=synthetic precision=int8", 1, "precision: expected one of", "'int8'"),
     ("prepare task=paint", 1, "task: expected one of render, check; found 'paint'"),
 ]
