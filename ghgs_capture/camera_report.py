@@ -10,10 +10,9 @@ import numpy as np
 from ghgs_capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.photographs import Pixels, fits_stored
-from ghgs_lit.data.mask_checks import find_equal_poses, measure_height
 from ghgs_lit.data.view import area_image, area_mask
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
+from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, median_height
 
 #: Least agreement of every view of a right calibration, and least gain of a better interpretation
 AGREES = 0.9
@@ -64,12 +63,13 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         InputError: a file cannot be read.
     """
     views = read_small_views(folder, folder.instants[0] if instant is None else instant)
-    same = find_equal_poses({view.name: view.camera.pose for view in views})
-    if same is not None:
-        return Diagnosis(False, f"{' and '.join(same)} have the same pose: one of them is a copy")
+    for one, other in itertools.combinations(views, 2):
+        if np.allclose(one.camera.pose, other.camera.pose, rtol=1e-6, atol=1e-6):
+            line = f"{one.name} and {other.name} have the same pose: one of them is a copy"
+            return Diagnosis(False, line)
     given = _score(folder, views)
     if given >= AGREES:
-        height = measure_height(_make_silhouettes(folder, views))
+        height = median_height(_make_silhouettes(folder, views))
         line = (
             f"cameras and masks agree ({given:.0%} of each mask or more lies in the hull of the others);"
             f" the subject is {float(f'{height:.3g}'):g} units tall"

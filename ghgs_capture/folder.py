@@ -25,7 +25,7 @@ from ghgs_capture.photographs import (
     read_pixels,
 )
 from ghgs_lit.config import nodes
-from ghgs_lit.data.mask_checks import find_mask_problem
+from ghgs_lit.data.decoding import check_mask
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.runtime.cores import allowed_cores
 
@@ -212,10 +212,8 @@ class CaptureFolder:
         camera = self.file.cameras[name]
         pixels = read_pixels(path) if isinstance(path, Path) else path.pixels()
         matte = self._matte(name, camera, path, pixels)
-        problem = find_mask_problem(matte > 127)
-        if problem is not None:
-            mask = self._mask(path) if self.backgrounds is None else None
-            raise InputError(f"{mask or path}: {problem}")
+        mask = self._mask(path) if self.backgrounds is None else None
+        check_mask(mask or path, matte > 127)
         return camera, pixels, matte
 
     def _mask(self, path: Source) -> Source | None:

@@ -145,7 +145,7 @@ class Instants(DataOptions):
     def ring(self) -> int:
         return len(self.cameras)
 
-    def reader(self, phase: str, strict: bool = True) -> InstantReader:
+    def reader(self, phase: str) -> InstantReader:
         listing = self.folder / LISTING
         if not listing.exists():
             raise InputError(f"{listing}: expected the instants that ghgs adapt has written; found none")

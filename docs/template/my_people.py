@@ -22,8 +22,8 @@ from ghgs_lit.errors import InputError, require
 class MyReader(Reader):
     """The photographs of one phase as they are stored."""
 
-    def __init__(self, folder: Path, strict: bool = True) -> None:
-        super().__init__(strict)
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
         self.folder = folder
         # CHANGE: every subject (a person, or a frame of one) and the numbers of its cameras.
         people = sorted(p for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
@@ -76,5 +76,5 @@ class MyPeople(DataSet):
     static_cameras: ClassVar[bool] = True  # CHANGE: False if there are views between the cameras
     ring: ClassVar[int] = 8  # CHANGE: number of cameras; inputs are evenly spaced among them
 
-    def reader(self, phase: str, strict: bool = True) -> MyReader:
-        return MyReader(self.folder / phase, strict)
+    def reader(self, phase: str) -> MyReader:
+        return MyReader(self.folder / phase)

@@ -105,12 +105,11 @@ def _find_missing_files(
 ) -> None:
     """Add a line for each missing file of a phase; ``bodies`` is the message for a missing body, None: no
     body is required."""
-    reader = data.dataset.reader(phase, strict=False)
-    missing += reader.problems
+    reader = data.dataset.reader(phase)
     for name in reader.subjects:
         body = reader.body_place(name)
-        for path in missing.attempt(reader.files, name) or ():
-            if not path.exists() and not (bodies and path == body):
+        for path in reader.files(name):
+            if not path.exists():
                 missing.append(f"{path}: expected a file of the data set; found none")
         if bodies and isinstance(body, Path) and not body.exists():
             missing.append(f"{body}: {bodies}")

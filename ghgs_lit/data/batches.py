@@ -1,7 +1,6 @@
 """Datasets whose items are whole :class:`Batch` objects, and their loaders."""
 
 import itertools
-import multiprocessing
 import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -17,10 +16,8 @@ from ghgs_lit.data.sampling import Sample, TrainingSampler
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_lit.types import Batch
 
-#: Number of batches below which worker processes take longer to start than they save: forked workers,
-#: and workers that import all modules.
-_FEW_FORKED = 32
-_FEW_STARTED = 256
+#: Number of batches below which worker processes may take longer to start than they save.
+_FEW = 256
 #: Maximum number of workers; more wait for the disk.
 _MOST = 8
 
@@ -114,9 +111,7 @@ def choose_workers(batches: float, processes: int, on_gpu: bool, cores: int | No
     Returns:
         Number of workers of each process.
     """
-    use_known_start_method()
-    few = _FEW_FORKED if multiprocessing.get_start_method() == "fork" else _FEW_STARTED
-    if not on_gpu or batches < few:
+    if not on_gpu or batches < _FEW:
         return 0
     spare = (cores or allowed_cores()) // processes - 1
     return min(max(spare, 1), _MOST)

@@ -82,13 +82,11 @@ class DataOptions(Options):
         return PhotographsDataModule(self, views, targets, seed, augmentation)
 
     @abstractmethod
-    def reader(self, phase: str, strict: bool = True) -> Reader:
+    def reader(self, phase: str) -> Reader:
         """Create the reader of a split.
 
-        Args:
-            phase: name of the split.
-            strict: whether to raise the first problem of the data or to collect all, as in
-                :class:`Reader`.
+        Raises:
+            InputError: the data set has missing or bad files.
         """
 
     def has(self, phase: str) -> bool:

@@ -42,6 +42,9 @@ _OFF_CENTRE = 0.25
 _ROTATION_TOLERANCE = 1e-3
 #: Maximum coordinate of a vertex: one kilometre in millimetres.
 _FURTHEST = 1e6
+# Minimum share of an image, and maximum share of its border, that a person covers.
+_LEAST_SHARE = 1e-3
+_MOST_BORDER = 0.5
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
 Shapes = Sequence[tuple[int | None, ...]]
@@ -345,6 +348,21 @@ def check_view(place: Path | str, view: View) -> None:
             raise InputError(f"{place}: {name}: expected {expected}; found {found}")
     check_intrinsics(f"{place}: intrinsics", view.intrinsics)
     check_extrinsics(f"{place}: extrinsics", view.extrinsics)
+
+
+def check_mask(place: Path | str, mask: np.ndarray) -> None:
+    """Check a mask, [h, w] bool and true on the subject.
+
+    Raises:
+        InputError: the subject is too small, or the mask is full or inverted.
+    """
+    border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1])).mean()
+    if border > _MOST_BORDER:
+        expected = "a mask of the subject, not of the background"
+        raise InputError(f"{place}: expected {expected}; found {border:.0%} of the border in it")
+    if mask.mean() < _LEAST_SHARE:
+        expected = f"a subject of {_LEAST_SHARE:.1%} of the photograph or more"
+        raise InputError(f"{place}: expected {expected}; found {mask.sum()} pixels")
 
 
 def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ghgs_lit.config.options import Options
 from ghgs_lit.data.decoding import (
     check_array,
     check_center,
@@ -27,16 +26,6 @@ from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 log = logging.getLogger(__name__)
 
 
-def check_frames(options: Options) -> None:
-    """Reject an empty range ``options.frames``.
-
-    Raises:
-        InputError: start is not below stop.
-    """
-    start, stop, _ = options.frames
-    options.require(start < stop, "frames", "[start, stop, step] with start < stop")
-
-
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera in OpenCV's conventions.
@@ -44,7 +33,7 @@ class Camera:
     Attributes:
         intrinsics: [3, 3] in pixels, with pixel centres at integers.
         extrinsics: [4, 4], world to camera, metres.
-        distortion: coefficients k1 k2 p1 p2 (k3), by which images are undistorted; None: they are not.
+        distortion: coefficients k1 k2 p1 p2 (k3), which is removed; None: there is none.
     """
 
     intrinsics: np.ndarray
@@ -105,7 +94,6 @@ class FrameReader(Reader):
         phase: ``train`` or ``val``.
         sequences: name and requested frames of each sequence.
         example: name of a sequence, for messages.
-        strict: whether to raise the first problem of the data or to collect all.
 
     Raises:
         InputError: all sequences are missing, or one is bad.
@@ -115,24 +103,21 @@ class FrameReader(Reader):
     calibration: ClassVar[str]
 
     def __init__(
-        self, data: Any, phase: str, sequences: Sequence[tuple[str, range]], example: str, strict: bool
+        self, folder: Path, phase: str, sequences: Sequence[tuple[str, range]], example: str
     ) -> None:
-        super().__init__(strict)
-        self.data = data
+        super().__init__()
         self.frames: dict[str, Frame] = {}
-        folder = data.folder
         there = [sequence for sequence in sequences if (folder / sequence[0]).is_dir()]
-        if 0 < len(there) < len(sequences):
-            log.warning("%s: %d of %d sequences of %s are there", folder, len(there), len(sequences), phase)
         if not there:
             some = "such as" if sequences else "beside those of val, such as"
-            self.add_problem(f"{folder}: expected sequences {some} {example}; found none of {phase}")
+            raise InputError(f"{folder}: expected sequences {some} {example}; found none of {phase}")
+        if len(there) < len(sequences):
+            log.warning("%s: %d of %d sequences of %s are there", folder, len(there), len(sequences), phase)
         for name, wanted in there:
-            with self.collect_problems():
-                found = self.frames_of(folder / name, wanted)
-                self.frames |= {check_name(f"{name}_{frame.number:06d}"): frame for frame in found}
-                if len(found) < len(wanted):
-                    log.info("%s: %d of %d frames are there", folder / name, len(found), len(wanted))
+            found = self.frames_of(folder / name, wanted)
+            self.frames |= {check_name(f"{name}_{frame.number:06d}"): frame for frame in found}
+            if len(found) < len(wanted):
+                log.info("%s: %d of %d frames are there", folder / name, len(found), len(wanted))
         self.subjects = {name: frame.positions for name, frame in self.frames.items()}
 
     @abstractmethod
@@ -151,12 +136,8 @@ class FrameReader(Reader):
         """Path of an image, which need not exist."""
 
     @abstractmethod
-    def masks(self, frame: Frame, position: int) -> list[Path]:
-        """Files whose union is the mask of an image; all values except 0 are the subject."""
-
-    def body_files(self, frame: Frame) -> Sequence[Path]:
-        """Files on which a frame's body depends, first the frame's own file."""
-        return ()
+    def mask(self, frame: Frame, position: int) -> Path:
+        """Path of an image's mask, which need not exist; all values except 0 are the subject."""
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """Read an image on black, see :meth:`Reader.read_view`. There are no views between cameras and no
@@ -165,9 +146,7 @@ class FrameReader(Reader):
         path = self.photograph(frame, position)
         image = read_photograph(path)
         size = image.shape[:2]
-        mask = np.zeros(size, bool)
-        for file in self.masks(frame, position):
-            mask |= read_map(file, size) != 0
+        mask = read_map(self.mask(frame, position), size) != 0
         camera = frame.cameras[position]
         intrinsics = half_centers(camera.intrinsics)
         check_center(path, camera.intrinsics, *size)
@@ -179,14 +158,12 @@ class FrameReader(Reader):
         matrices = (matrix.astype(np.float32) for matrix in (intrinsics, camera.extrinsics))
         return View(image, mask, None, *matrices)
 
-    def sources(self, name: str) -> Iterator[Path | str]:
+    def sources(self, name: str) -> Iterator[Path]:
         frame = self.frames[name]
-        yield f"undistorted: {frame.cameras[0].distortion is not None}"
         yield frame.folder / self.calibration
         for position in frame.positions:
             yield self.photograph(frame, position)
-            yield from self.masks(frame, position)
-        yield from self.body_files(frame)
+            yield self.mask(frame, position)
 
     def place(self, name: str, position: int, view: int) -> str:
-        return str(self.masks(self.frames[name], position)[0])
+        return str(self.mask(self.frames[name], position))

@@ -18,10 +18,8 @@ without ``rendering/`` comes from another renderer and counts as complete.
 
 import itertools
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -107,9 +105,8 @@ class Rendered(DataOptions):
             return (self.folder / phase).is_dir() or bool(Completeness(self.folder).plan.get(phase))
         return len(names) > 0
 
-    def reader(self, phase: str, strict: bool = True) -> "Layout":
-        names = self.subject_names(phase)
-        return Layout(self.folder, phase, names, self.pixel_centers, strict)
+    def reader(self, phase: str) -> "Layout":
+        return Layout(self.folder, phase, self.subject_names(phase), self.pixel_centers)
 
 
 class Layout(Reader):
@@ -121,63 +118,48 @@ class Layout(Reader):
             the split may have changed; None: all.
         pixel_centers: the renderer's convention: ``half`` (+0.5, as in this package), ``integer`` (as in
             the published scripts) or ``auto`` (integer unless this package rendered the data).
-        strict: whether to raise the first problem or to collect all.
 
     Raises:
         InputError: the root or phase is missing, empty, not completely rendered, or lacks one of
-            ``names``.
+            ``names``; without ``names``, a subject is in both phases.
     """
 
     def __init__(
-        self,
-        root: str | Path,
-        phase: str,
-        names: Sequence[str] | None = None,
-        pixel_centers: str = "half",
-        strict: bool = True,
+        self, root: str | Path, phase: str, names: Sequence[str] | None = None, pixel_centers: str = "half"
     ) -> None:
-        super().__init__(strict)
-        self.root = Path(root).expanduser()
-        self._complete = Completeness(self.root)
-        integer = pixel_centers == "auto" and not self._complete.rendered_here
+        super().__init__()
+        root = Path(root).expanduser()
+        require_folder(root, "the root of a rendered data set")
+        complete = Completeness(root)
+        integer = pixel_centers == "auto" and not complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
         self._folders: dict[str, Path] = {}
-        require_folder(self.root, "the root of a rendered data set")
-        phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]
-        stored = {p: _positions(self.root / p / "img") for p in phases}
-        images = self.root / phase / "img"
+        images = root / phase / "img"
+        stored = {p: _positions(root / p / "img") for p in (phase, *PHASES)}
+        if names is None:
+            both = sorted(stored["train"].keys() & stored["val"].keys())
+            if both:
+                found = f"{both[0]!r} in both"
+                raise InputError(f"{root}: expected each subject in train or in val; found {found}")
+            names = sorted({*stored[phase], *complete.plan.get(phase, [])})
+            stored = {phase: stored[phase]}
         if not any(stored.values()):
             require_folder(images, "a folder <id>_<position> for every camera")
-        if names is None:
-            other = _positions(self.root / next(p for p in PHASES if p != phase) / "img")
-            for name in sorted(stored[phase].keys() & other.keys()):
-                self.add_problem(
-                    f"{self.root}: expected each subject in train or in val; found {name!r} in both"
-                )
-        planned = self._complete.plan.get(phase, [])
-        listed = {*stored[phase], *planned}
-        wanted = sorted(listed) if names is None else list(map(normalize_name, names))
-        homes = {}
-        for name in wanted:
-            homes[name] = next((p for p in phases if name in stored[p]), phase)
+        if not names:
+            raise InputError(f"{images}: expected folders <id>_<position>; found none")
         missing = []
-        for name, home in homes.items():
-            if name not in stored[home] or self._complete.missing(home, [name]):
+        for name in map(normalize_name, names):
+            home = next((p for p in stored if name in stored[p]), phase)
+            if name in stored[home] and not complete.missing(home, [name]):
+                self.subjects[name] = tuple(sorted(stored[home][name]))
+                self._folders[name] = root / home
+            else:
                 missing.append(name)
-        if missing and self.strict:
+        if missing:
             raise InputError(
-                f"{images}: expected {len(wanted)} whole subjects; found {len(wanted) - len(missing)} "
+                f"{images}: expected {len(names)} whole subjects; found {len(names) - len(missing)} "
                 f"({missing[0]} is missing or half-rendered: render again to finish)"
             )
-        for name in missing:
-            self.add_problem(
-                f"{images / name}_000: expected a whole subject; found none, or a half-rendered one"
-            )
-        if not wanted:
-            self.add_problem(f"{images}: expected folders <id>_<position>; found none")
-        for name in (n for n in wanted if n not in missing):
-            self.subjects[name] = tuple(sorted(stored[homes[name]][name]))
-            self._folders[name] = self.root / homes[name]
 
     def place(self, name: str, position: int, view: int) -> str:
         return str(self._folder(name, "mask", position) / f"{view}.png")
@@ -193,38 +175,24 @@ class Layout(Reader):
             for kind in _KINDS:
                 folder = self._folder(name, kind, position)
                 yield from folder.iterdir() if folder.is_dir() else ()
-        body = self._body(name)
-        yield from () if body is None else (body,)
 
     def files(self, name: str) -> Iterator[Path]:
         positions = self.subjects[name]
-        views = {position: self.views_at(name, position) for position in positions}
-        counts = Counter(itertools.chain.from_iterable(views.values()))
-        usual = {view for view, count in counts.items() if 2 * count > len(positions)}
-        for position in sorted(self._usual_positions.union(positions)):
-            for view in sorted(usual.union(views.get(position, ()))):
-                yield self._file(name, "img", position, str(view), _IMAGE_SUFFIXES)
-                yield self._file(name, "mask", position, f"{view}.png")
-                yield self._file(name, "parm", position, f"{view}_intrinsic.npy")
-                yield self._file(name, "parm", position, f"{view}_extrinsic.npy")
-
-    @cached_property
-    def _usual_positions(self) -> set[int]:
-        """Positions that at least half of the subjects have."""
-        counts = Counter(itertools.chain.from_iterable(self.subjects.values()))
-        return {position for position, count in counts.items() if 2 * count >= len(self.subjects)}
+        views = sorted(set().union(*(self.views_at(name, position) for position in positions)))
+        for position, view in itertools.product(positions, views):
+            yield self._file(name, "img", position, str(view), _IMAGE_SUFFIXES)
+            yield self._file(name, "mask", position, f"{view}.png")
+            yield self._file(name, "parm", position, f"{view}_intrinsic.npy")
+            yield self._file(name, "parm", position, f"{view}_extrinsic.npy")
 
     def body_place(self, name: str) -> Path:
-        return self._body(name) or self._folders[name] / f"{_BODY_MODELS[0]}/{name}/vertices.npy"
+        folder = self._folders[name]
+        files = [f"{model}/{name}/vertices.npy" for model in _BODY_MODELS]
+        return next((path for file in files if (path := find_path(folder, file))), folder / files[0])
 
     def read_body(self, name: str) -> np.ndarray | None:
-        path = self._body(name)
-        return None if path is None else read_vertices(path)
-
-    def _body(self, name: str) -> Path | None:
-        """File of a subject's body; None: it has none."""
-        paths = (find_path(self._folders[name], f"{model}/{name}/vertices.npy") for model in _BODY_MODELS)
-        return next((path for path in paths if path is not None), None)
+        path = self.body_place(name)
+        return read_vertices(path) if path.exists() else None
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """Read an image with its mask, camera and optional maps, see :meth:`Reader.read_view`."""
@@ -235,19 +203,12 @@ class Layout(Reader):
         path = self._file(name, "depth", position, f"{view}.png")
         if depth and path.exists():
             inverse = read_map(path, size)
-            found = "8" if inverse.dtype == np.uint8 else f"{inverse.min()} to {inverse.max()}"
-            if inverse.dtype == np.uint8 or inverse.min() < 0 or inverse.max() > np.iinfo(np.uint16).max:
-                raise InputError(f"{path}: expected 16 bits of inverse depth; found {found}")
-            inverse = inverse.astype(np.uint16)
-            is_seen = inverse.any() or not mask.any()
-            require(is_seen, str(path), "inverse depth above 0 at the subject", "0 everywhere")
+            require(inverse.dtype == np.uint16, str(path), "16 bits of inverse depth", inverse.dtype.name)
         matte = None
         path = self._file(name, "alpha", position, f"{view}.png")
         if path.exists():
             matte = read_map(path, size)
-            if matte.dtype != np.uint8:
-                raise InputError(f"{path}: expected 8 bits of grey; found {matte.dtype}")
-            require(matte.any() or not mask.any(), str(path), "shares above 0 at the subject", "0 everywhere")
+            require(matte.dtype == np.uint8, str(path), "8 bits of grey", matte.dtype.name)
         path = self._file(name, "parm", position, f"{view}_intrinsic.npy")
         intrinsics = check_intrinsics(path, read_array(path, [(3, 3)]))
         path = self._file(name, "parm", position, f"{view}_extrinsic.npy")

@@ -4,9 +4,8 @@ A data set implements a :class:`Reader`, which finds and decodes its files. Resi
 (:class:`Photographs`), as well as sampling, are the same for all data sets.
 """
 
-import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,18 +31,12 @@ class Reader(ABC):
     An image is identified by (position, view). ``position`` is the index of a camera, or of a position on
     the ring; ``view`` is 0 except on rings that were rendered with further views between cameras.
 
-    Args:
-        strict: whether to raise the first problem of the data set or to collect all in ``problems``.
-
     Attributes:
         subjects: camera positions of each subject (a person, or one frame of a person).
-        problems: one line for each problem of the data set.
     """
 
-    def __init__(self, strict: bool = True) -> None:
-        self.strict = strict
+    def __init__(self) -> None:
         self.subjects: dict[str, tuple[int, ...]] = {}
-        self.problems: list[str] = []
 
     @abstractmethod
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
@@ -71,8 +64,8 @@ class Reader(ABC):
         return f"{name}, camera {position}, view {view}"
 
     def sources(self, name: str) -> Iterable[Path | str]:
-        """Everything on which a subject's images and body depend: paths of files, and texts that describe
-        options of their decoding. Empty: unknown, so that the subject is never packed
+        """Everything on which a subject's images depend: paths of files, and texts that describe options of
+        their decoding. Empty: unknown, so that the subject is never packed
         (:mod:`ghgs_lit.data.packed`)."""
         return ()
 
@@ -94,7 +87,8 @@ class Reader(ABC):
         stored = self.read_view(name, position, view, depth)
         place = self.place(name, position, view)
         check_view(place, stored)
-        if not stored.mask.any():
+        subject = stored.mask if stored.matte is None else stored.matte >= 128
+        if not subject.any():
             raise InputError(f"{place}: expected a subject in the mask; found none")
         return stored
 
@@ -108,28 +102,6 @@ class Reader(ABC):
         if vertices is not None:
             check_array(f"{name}: body", vertices, [(None, 3)])
         return vertices
-
-    @contextlib.contextmanager
-    def collect_problems(self) -> Iterator[None]:
-        """Context that collects an InputError in ``problems``, or raises it if the reader is strict."""
-        try:
-            yield
-        except InputError as error:
-            if self.strict:
-                raise
-            self.problems.append(str(error))
-
-    def add_problem(self, line: str) -> None:
-        """Raise or collect a problem of the data set.
-
-        Args:
-            line: the message, ``<place>: expected ...; found ...``.
-
-        Raises:
-            InputError: the reader is strict.
-        """
-        with self.collect_problems():
-            raise InputError(line)
 
 
 class Photographs:

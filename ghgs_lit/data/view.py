@@ -160,19 +160,15 @@ class View:
     @property
     def depth(self) -> np.ndarray | None:
         """Depth [h, w] float32 in metres, 0 where unknown."""
-        return None if self.inverse_depth is None else _depths()[self.inverse_depth]
+        if self.inverse_depth is None:
+            return None
+        known = self.inverse_depth > 0
+        return np.where(known, DEPTH_SCALE / np.where(known, self.inverse_depth, 1), 0).astype(np.float32)
 
     @property
     def alpha(self) -> np.ndarray | None:
         """Matte [h, w] float32 in [0, 1]."""
         return None if self.matte is None else np.divide(self.matte, 255, dtype=np.float32)
-
-
-@lru_cache(maxsize=1)
-def _depths() -> np.ndarray:
-    """Table [65536] float32 of the depth in metres of each inverse depth; 0 for 0."""
-    inverse = np.arange(1, 1 << 16)
-    return np.concatenate(([0], DEPTH_SCALE / inverse)).astype(np.float32)
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Options and reader of ZJU-MoCap.
 
-``<root>/CoreView_<id>/`` contains ``annots.npy``, the images of each camera, ``mask_cihp/`` and sometimes
-``mask/`` (label maps: all values except 0 are the subject), ``new_vertices/`` and ``vertices/`` (<frame
-number>.npy: 6890 x 3, metres, world with z up).
+``<root>/CoreView_<id>/`` contains ``annots.npy``, the images of each camera, ``mask_cihp/`` (label maps: all
+values except 0 are the subject), ``new_vertices/`` and ``vertices/`` (<frame number>.npy: 6890 x 3, metres,
+world with z up).
 
 ``annots.npy`` is a pickled dictionary in an array without dimensions: ``cams`` with lists ``K`` (3, 3),
 ``D`` (4 or 5 coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world to camera;
@@ -22,7 +22,7 @@ from pydantic import AfterValidator, Field, model_validator
 from ghgs_lit.config.options import Count, Index, Options, Size, Text
 from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.decoding import check_array, read_array
-from ghgs_lit.data.frames import Camera, Frame, FrameReader, check_frames, read_camera, spread
+from ghgs_lit.data.frames import Camera, Frame, FrameReader, read_camera, spread
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.errors import InputError
 from ghgs_lit.parsing import find_path
@@ -31,6 +31,9 @@ MILLIMETRE = 0.001
 # Distance in metres below which cameras were not given in millimetres.
 _NEAREST = 0.1
 BODY_VERTICES = 6890
+#: Number of cameras used of each sequence, the first ones, which form the ring.
+CAMERAS = 20
+_MASKS = "mask_cihp"
 #: Folders of vertices; the first one that exists is read.
 _BODIES = ("new_vertices", "vertices")
 
@@ -118,49 +121,39 @@ class ZJUMoCapReader(FrameReader):
 
     calibration = "annots.npy"
 
-    def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
+    def __init__(self, data: "ZJUMoCap", phase: str) -> None:
         sequences = []
         for some in getattr(data.split, phase):
             sequences += [(f"CoreView_{name}", range(*some.frames)) for name in some.sequences]
-        super().__init__(data, phase, sequences, sequences[0][0], strict)
+        super().__init__(data.folder, phase, sequences, sequences[0][0])
 
     def frames_of(self, folder: Path, wanted: range) -> list[Frame]:
         path = folder / self.calibration
         cameras, photographs = read_annotations(path)
-        if not self.data.undistorted:
-            cameras = [replace(camera, distortion=None) for camera in cameras]
-        count = self.data.cameras or len(cameras)
-        if count > len(cameras):
-            raise InputError(f"{path}: expected {count} cameras; found {len(cameras)}")
+        if len(cameras) < CAMERAS:
+            raise InputError(f"{path}: expected {CAMERAS} cameras; found {len(cameras)}")
         chosen = [names for index, names in enumerate(photographs) if index in wanted]
         if not chosen:
             raise InputError(f"{path}: expected a frame {wanted.start}; found {len(photographs)} frames")
-        positions = tuple(range(count))
+        positions = tuple(range(CAMERAS))
         return [Frame(folder, frame_number(folder / names[0]), cameras, positions, names) for names in chosen]
 
     def photograph(self, frame: Frame, position: int) -> Path:
         photograph = frame.photographs[position]
         return _find(frame.folder, photograph, photograph.suffix)
 
-    def masks(self, frame: Frame, position: int) -> list[Path]:
-        folders = [path for name in self.data.masks if (path := frame.folder / name).is_dir()]
-        if not folders:
-            expected = f"a folder of masks, {' or '.join(self.data.masks)}"
-            raise InputError(f"{frame.folder}: expected {expected}; found none")
-        return [_find(folder, frame.photographs[position], ".png") for folder in folders]
-
-    def body_files(self, frame: Frame) -> list[Path]:
-        folders = [path for name in _BODIES if (path := frame.folder / name).is_dir()]
-        return [folder / f"{frame.number}.npy" for folder in folders[:1]]
-
-    def read_body(self, name: str) -> np.ndarray | None:
-        files = self.body_files(self.frames[name])
-        return read_array(files[0], [(BODY_VERTICES, 3)]).astype(np.float32) if files else None
+    def mask(self, frame: Frame, position: int) -> Path:
+        return _find(frame.folder / _MASKS, frame.photographs[position], ".png")
 
     def body_place(self, name: str) -> Path:
         frame = self.frames[name]
-        files = self.body_files(frame)
-        return files[0] if files else frame.folder / _BODIES[0] / f"{frame.number}.npy"
+        folders = [frame.folder / kind for kind in _BODIES]
+        folder = next((path for path in folders if path.is_dir()), folders[0])
+        return folder / f"{frame.number}.npy"
+
+    def read_body(self, name: str) -> np.ndarray | None:
+        path = self.body_place(name)
+        return read_array(path, [(BODY_VERTICES, 3)]).astype(np.float32) if path.exists() else None
 
 
 def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
@@ -181,12 +174,8 @@ class Frames(Options):
 
     @model_validator(mode="after")
     def _check(self) -> "Frames":
-        check_frames(self)
+        self.require(self.frames[0] < self.frames[1], "frames", "[start, stop, step] with start < stop")
         return self
-
-
-# Number of cameras assumed if all are used; some sequences have 23.
-_ALL = 21
 
 
 class FramesByPhase(Options):
@@ -202,22 +191,12 @@ class ZJUMoCap(DataSet):
     """Downloaded ZJU-MoCap sequences below ``root``; each frame of a sequence is a subject."""
 
     static_cameras: ClassVar[bool] = True
+    ring: ClassVar[int] = CAMERAS
 
     name: Text = "zju_mocap"
     size: Size = 512
     split: FramesByPhase
     """Sequences and frames of each phase."""
-    cameras: Annotated[int, Field(ge=2)] | None = 20
-    """Number of cameras used of each sequence, the first ones, which form the ring; null: all, with a ring
-    of 21."""
-    undistorted: bool = True
-    """Remove the lens distortion of images and masks (SHERF does not, most others do)."""
-    masks: tuple[Text, ...] = Field(("mask_cihp",), min_length=1)
-    """Folders of label maps, whose union is the mask; folders that a sequence lacks are skipped."""
 
-    @property
-    def ring(self) -> int:
-        return self.cameras or _ALL
-
-    def reader(self, phase: str, strict: bool = True) -> ZJUMoCapReader:
-        return ZJUMoCapReader(self, phase, strict)
+    def reader(self, phase: str) -> ZJUMoCapReader:
+        return ZJUMoCapReader(self, phase)

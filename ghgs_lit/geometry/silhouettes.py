@@ -164,3 +164,9 @@ def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float
     meeting = meeting_point(*(torch.from_numpy(np.stack(each)) for each in (centers, rays)))
     focus = meeting.numpy()
     return focus, float(max(np.linalg.norm(s.extent(focus)) for s in silhouettes))
+
+
+def median_height(silhouettes: Sequence[Silhouette]) -> float:
+    """Median height in the world's unit of the subject of several silhouettes."""
+    focus, _ = subject_sphere(silhouettes)
+    return float(np.median([s.extent(focus)[0] for s in silhouettes]))

@@ -45,7 +45,7 @@ def project(tmp_path):
             np.savez(
                 folder / "cameras.npz", intrinsics=cameras.intrinsics, extrinsics=cameras.extrinsics[:, :3]
             )
-            np.save(folder / "body.npy", rng.normal(size=(50, 3)) * 0.2)
+            np.save(folder / "body.npy", rng.uniform(-1, 1, (50, 3)) * [0.2, 0.6, 0.2])
     return tmp_path
 
 

@@ -220,13 +220,12 @@ DAMAGES = [
     (content(IMAGE, b"no image"), r"box_000/0\.jpg: expected a readable image; found"),
     (remove(MASK), r"mask/box_000/0\.png: expected an image; found no such file"),
     (picture("mask", SMALL), rf"mask/box_000/0\.png: {OF_PHOTOGRAPH}"),
-    (picture("depth", ZEROS), r"depth/box_000/0\.png: expected 16 bits of inverse depth; found 8"),
-    (picture("depth", ZEROS.astype(np.uint16)), r"depth/.*: expected .* above 0 at the subject; found '0 ev"),
+    (picture("depth", ZEROS), r"depth/box_000/0\.png: expected 16 bits of inverse depth; found 'uint8'"),
     (
         picture("alpha", ZEROS.astype(np.uint16)),
-        r"alpha/box_000/0\.png: expected 8 bits of grey; found uint16",
+        r"alpha/box_000/0\.png: expected 8 bits of grey; found 'uint16'",
     ),
-    (picture("alpha", ZEROS), r"alpha/box_000/0\.png: expected .* above 0 at the subject; found '0 every"),
+    (picture("alpha", ZEROS), r"mask/box_000/0\.png: expected a subject in the mask; found none"),
     (picture("alpha", SMALL), rf"alpha/box_000/0\.png: {OF_PHOTOGRAPH}"),
     (
         camera("intrinsic", lambda k: k * [[0, 1, 1], [1, 1, 1], [1, 1, 1]]),
@@ -288,9 +287,6 @@ def test_a_half_rendered_subject_is_refused(root):
     (root / "rendering" / "done" / "train").mkdir(parents=True)
     line = r"expected 1 whole subjects; found 0 \(box is missing or half-rend"
     refused(line, lambda: Layout(root, "train"))
-    lenient = Layout(root, "train", strict=False)
-    assert not lenient.subjects
-    assert "half-rendered" in str(lenient.problems[0])
     (root / "rendering" / "done" / "train" / "box").touch()
     assert list(Layout(root, "train").subjects) == ["box"]
 

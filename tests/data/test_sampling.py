@@ -1,11 +1,11 @@
 """Sampling protocols and data modules: camera angles, batches, errors, and training samples that resume
 exactly, are fair and depend on the seed."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
-from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 
 from ghgs_lit.data.sampling import (
     TargetProtocol,
@@ -144,8 +144,6 @@ def test_batches_have_the_shapes_and_values_they_promise(boxes):
 
 def test_data_without_depth_or_body_says_none(boxes, tmp_path):
     """Missing depths, bodies or mattes, even of a single image, become None, not zeros."""
-    import shutil
-
     shutil.copytree(boxes / "train", tmp_path / "train")
     shutil.rmtree(tmp_path / "train" / "depth")
     shutil.rmtree(tmp_path / "train" / "smpl" / "s1")
@@ -155,50 +153,6 @@ def test_data_without_depth_or_body_says_none(boxes, tmp_path):
     assert batch.depths is None
     assert batch.alpha is None
     assert batch.body_vertices is None
-
-
-class Recorder(LightningModule):
-    """Module with a single weight that records its samples."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.seen = []
-
-    def training_step(self, batch, _):
-        self.seen.append((batch.subjects, batch.views, batch.targets.names))
-        return (self.weight * batch.images.mean()) ** 2
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
-def train(boxes, steps, checkpoint=None, folder=None, workers=0):
-    recorder = Recorder()
-    saver = ModelCheckpoint(folder, every_n_train_steps=3, save_top_k=-1, filename="{step}")
-    trainer = Trainer(
-        max_steps=steps,
-        accelerator="cpu",
-        logger=False,
-        callbacks=[saver],
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        limit_val_batches=0,
-    )
-    data = module(boxes, views=RANDOM, steps_per_epoch=4, workers=workers)
-    trainer.fit(recorder, datamodule=data, ckpt_path=checkpoint)
-    return recorder.seen
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_training_resumes_with_the_very_next_draw(boxes, tmp_path):
-    """A run that stops after 3 steps of an epoch of 4 resumes with the fourth, not with the first."""
-    whole = train(boxes, 10, folder=tmp_path / "a")
-    assert len(set(map(str, whole))) == 10
-    for done in (3, 9):
-        rest = train(boxes, 10, tmp_path / "a" / f"step={done}.ckpt", tmp_path / "b")
-        assert rest == whole[done:]
 
 
 def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
@@ -247,8 +201,6 @@ def test_impossible_values_fail_at_once(boxes, changes, message):
 
 def test_fewer_views_than_asked(boxes, tmp_path):
     """Too few cameras raise with the subject's name, unless other positions are listed."""
-    import shutil
-
     for kind in ("img", "mask", "parm", "depth"):
         for position in (0, 4, 9):
             for phase, name in (("train", "s0"), ("val", "s3")):

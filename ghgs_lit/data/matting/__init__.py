@@ -42,8 +42,6 @@ class MattingNetwork(nn.Module):
         self.down = nn.ModuleList(_convolutions(*pair) for pair in pairwise((_FEATURES, *_WIDTHS)))
         self.up = nn.ModuleList(_convolutions(fine + coarse, fine) for fine, coarse in pairwise(_WIDTHS))
         self.out = nn.Conv2d(_WIDTHS[0], 4, 1)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
 
     def forward(
         self, images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
@@ -55,7 +53,7 @@ class MattingNetwork(nn.Module):
             mattes: rough mattes in [0, 1], such as masks of 0 and 1.
 
         Returns:
-            Mattes (limited to [0, 1] only in evaluation), and the subject's colours multiplied by them.
+            Mattes, and the subject's colours multiplied by them, in [0, 1].
         """
         height, width = images.shape[2:]
         whole = 2 ** (len(_WIDTHS) - 1)
@@ -68,15 +66,11 @@ class MattingNetwork(nn.Module):
         for block in reversed(self.up):
             x = block(torch.cat((finer.pop(), F.interpolate(x, scale_factor=2.0, mode="nearest")), 1))
         out = self.out(x)[..., :height, :width].float()
-        # A correction of up to 1.1 can invert a mask; initially it is 0.
-        estimate = mattes + 1.1 * torch.tanh(out[:, 0])
-        share = estimate.clamp(0, 1)
+        # A correction of up to 1.1 can invert a mask.
+        share = (mattes + 1.1 * torch.tanh(out[:, 0])).clamp(0, 1)
         # A pixel mixes the colours of subject and background; the network predicts their difference.
-        colors = images + (1 - share.detach())[:, None] * out[:, 1:]
-        if not self.training:
-            estimate = share
-            colors = colors.clamp(0, 1)
-        return estimate, estimate[:, None] * colors
+        colors = (images + (1 - share)[:, None] * out[:, 1:]).clamp(0, 1)
+        return share, share[:, None] * colors
 
 
 def _convolutions(before: int, after: int) -> nn.Sequential:

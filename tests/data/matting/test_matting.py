@@ -16,10 +16,11 @@ from tests.helpers.figures import Figure
 
 @pytest.fixture
 def network():
-    """A network with random weights also in its last layer."""
+    """A network with large random weights in its last layer."""
     torch.manual_seed(0)
     found = MattingNetwork().eval()
     torch.nn.init.normal_(found.out.weight, std=0.3)
+    torch.nn.init.zeros_(found.out.bias)
     return found
 
 
@@ -29,13 +30,6 @@ def photographs(count=2, height=45, width=38):
     for i in range(count):
         mattes[i, 8 + i : 38, 10 : 25 + 3 * i] = 1
     return torch.rand(count, 3, height, width, generator=rng), mattes
-
-
-def test_a_new_network_leaves_everything():
-    images, mattes = photographs()
-    found, subjects = MattingNetwork().eval()(images, mattes)
-    assert torch.equal(found, mattes)
-    assert torch.equal(subjects, images * mattes[:, None])
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (45, 38), (64, 64)])
@@ -68,15 +62,6 @@ def test_colors_change_at_the_rim_alone(network):
     assert torch.equal(subjects[sure], images[sure])
 
 
-def test_training_pulls_from_beyond_0_and_1(network):
-    """Mattes are clamped only in evaluation, so that every error has a gradient in training."""
-    images, mattes = photographs()
-    found, _ = network.train()(images, mattes)
-    assert found.min() < 0 or found.max() > 1
-    (found - mattes).abs().sum().backward()
-    assert all(weight.grad.isfinite().all() for weight in network.parameters())
-
-
 @pytest.mark.parametrize("value", [False, True])
 def test_without_an_outline_all_is_far_from_it(value):
     assert (_insideness(np.full((3, 4), value)) == (1 if value else -1)).all()
@@ -90,18 +75,6 @@ def test_colors_nearby_are_weighted_means():
     found = _near(torch.cat((color * weight, weight), 1), 3, torch.Size((48, 48)))
     torch.testing.assert_close(found[..., :20], color.expand(1, 3, 48, 20), atol=1e-3, rtol=0)
     assert (found[..., 40:] == 0).all()
-
-
-def test_colors_do_not_train_the_matte(network):
-    """The loss of colours must not reach the matte, which could otherwise change colours by including more
-    background."""
-    images, mattes = photographs()
-    found, subjects = network.train()(images, mattes)
-    colors = (subjects / found[:, None]).movedim(1, -1)[found > 0.2]
-    colors.sum().backward()
-    gradient = network.out.bias.grad.abs()
-    assert gradient[1:].min() > 1
-    assert gradient[0] < 1e-3
 
 
 HEIGHT, WIDTH = 216, 180
