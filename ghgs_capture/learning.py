@@ -119,9 +119,6 @@ class InstantReader(Reader):
     def read_body(self, name: str) -> np.ndarray | None:
         return None
 
-    def views_at(self, name: str, position: int) -> list[int]:
-        return [0]
-
 
 @functools.lru_cache(maxsize=64)
 def _read_crops(path: Path) -> dict[str, np.ndarray]:

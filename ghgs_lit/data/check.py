@@ -70,7 +70,6 @@ class SubjectReport:
     """Result of reading one subject.
 
     Attributes:
-        name: name of the subject.
         photos: number of its images, missing ones included.
         problems: lines about what is wrong.
         has_body: whether the subject has a body.
@@ -79,7 +78,6 @@ class SubjectReport:
         agreement: share of each mask inside the visual hull of the others; empty with a body.
     """
 
-    name: str
     photos: int = 0
     problems: list[str] = field(default_factory=list)
     has_body: bool = False
@@ -101,7 +99,7 @@ class _Subjects(Dataset):
 
     def __getitem__(self, index: int) -> SubjectReport:
         name = self.names[index]
-        report = SubjectReport(name)
+        report = SubjectReport()
         body = None
         try:
             body = self.reader.read_checked_body(name)
