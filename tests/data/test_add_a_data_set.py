@@ -54,7 +54,7 @@ def clean(monkeypatch):
     """Start each test without registered or imported plug-ins."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(registry.VARIABLE, raising=False)
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
     registry._installed_plugins.cache_clear()
     yield
     registry._installed_plugins.cache_clear()
@@ -91,7 +91,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
         "evaluation.targets=[cameras]", "evaluation.pictures=0", "hydra.run.dir=measured",
     ]  # fmt: skip
     monkeypatch.delenv(registry.VARIABLE)
-    registry._REGISTERED.clear()
+    del registry._REGISTERED["data", "my_people"]
     sys.modules.pop("my_people")
     assert ghgs(*arguments) == 1
     said = capsys.readouterr().err
@@ -157,7 +157,7 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
         registry._installed_plugins.cache_clear()
         assert build(node(project), "data", **KEYS).dataset.name == "m"
         monkeypatch.delenv(registry.VARIABLE, raising=False)
-        registry._REGISTERED.clear()
+        del registry._REGISTERED["data", "my_people"]
         sys.modules.pop("my_people")
         registry._installed_plugins.cache_clear()
 
