@@ -1,5 +1,6 @@
 """Training jobs: lock a run that is free and unfinished, then train or resume it."""
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,13 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.compose import to_plain
 from ghgs_lit.config.defaults import fill
-from ghgs_lit.config.keys import lookup
+from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.results import config_hash
-from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, find_runs_of_job
+from ghgs_lit.runs.run import AUTO, CURVES, MARKER, PLAN, RunDirectory, find_runs_of_job
 
 BUSY = "busy"  #: Return value of a job whose run is locked by another process
 _PATIENCE = 300.0  # seconds to wait for the first of several processes to begin
@@ -31,6 +32,27 @@ Train = Callable[[Run, Path, dict[str, Any]], float | None]
 def in_sweep() -> bool:
     """Whether Hydra launched this job as part of a multirun."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def find_curves(directory: Path) -> Path:
+    """Folder of a run's TensorBoard files, ``tensorboard`` or, in a sweep, a folder in it. Its name,
+    which TensorBoard shows, is made of the overrides that distinguish the run from the others.
+
+    Args:
+        directory: Directory of the run.
+
+    Returns:
+        The folder in which the run's files are, if any, whatever the sweep's present command.
+    """
+    folder = directory / "tensorboard"
+    begun = [path.parent for pattern in CURVES for path in directory.glob(pattern)]
+    if begun or not in_sweep():
+        return begun[0] if begun else folder
+    hydra = HydraConfig.get()
+    shared = _overrides_of(Path(hydra.sweep.dir))
+    changes = [text for text in hydra.overrides.task if text not in shared]
+    changes = [text for text in changes if is_hyperparameter(key_of(text))]
+    return folder / ",".join(changes).replace(os.sep, "_")[-200:]
 
 
 def _overrides_of(sweep: Path) -> list[str]:

@@ -36,6 +36,8 @@ from ghgs_lit.runs.results import config_hash, differences, read_results, valida
 AUTO = "auto"  #: Value of ``resume``: continue the run in the directory, if any
 MARKER = "run.json"
 PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, in the sweep's folder
+#: TensorBoard's files; in a sweep they are in a folder named after overrides.
+CURVES = ("tensorboard/events.out.tfevents.*", "tensorboard/*=*/events.out.tfevents.*")
 #: Files that training writes into a run's directory and that a new run deletes, apart from checkpoints of
 #: other names and Hydra's logs; other files in these folders belong to the user.
 _FILES = (
@@ -46,7 +48,7 @@ _FILES = (
     "metrics.json",
     "pictures/model_v*.png",
     "pictures/step_*/*.png",
-    "tensorboard/events.out.tfevents.*",
+    *CURVES,
 )
 WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Their top-level names
 

@@ -15,6 +15,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.errors import import_optional
 from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
+from ghgs_lit.runs.job import find_curves
 from ghgs_lit.runs.run import RunDirectory
 
 #: Metrics by which runs are compared; ``metrics.json`` contains all.
@@ -106,7 +107,7 @@ class TensorBoardOptions(Options):
 
     def build(self, save_dir: str) -> TensorBoardLog:
         """Create the logger of the run in ``save_dir``."""
-        return TensorBoardLog(save_dir, name="tensorboard", version="")
+        return TensorBoardLog(find_curves(Path(save_dir)), name="", version="")
 
 
 class WandbLog(WandbLogger):

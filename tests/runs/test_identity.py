@@ -182,7 +182,7 @@ def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
     assert len(RunDirectory(path).sessions()) == 1
 
 
-@pytest.mark.parametrize("place", ["pictures", "checkpoints", "faults", "tensorboard"])
+@pytest.mark.parametrize("place", ["pictures", "checkpoints", "faults", "tensorboard/seed=2"])
 def test_nothing_is_written_through_links(verb, tmp_path, place):
     """Regression: pictures were written to the target of a link."""
     run, outside = tmp_path / "sweep" / "run", tmp_path / "outside"

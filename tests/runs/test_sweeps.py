@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import re
+from pathlib import Path
 
 import pytest
 from hydra.core.utils import JobReturn, JobStatus
@@ -14,6 +15,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job
 from ghgs_lit.runs.results import config_hash, read_results
 from ghgs_lit.runs.sweep import combinations, run_all
+from ghgs_lit.training.loggers import TensorBoardOptions
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
@@ -98,6 +100,35 @@ def test_dry_run_runs_nothing_and_prints_states(sweep):
     assert executed(sweep.directory) == names
     assert re.search(rf"{names[0]} +done +100 +20\.\d\d +seed=1\n", out)
     assert "3 runs: 1 done, 2 missing" in out
+
+
+def test_curves_are_named_after_what_distinguishes_a_run(sweep, monkeypatch, tmp_path):
+    """TensorBoard shows these names; a run keeps its folder when another command continues it."""
+
+    def log(run, directory, stats):
+        folder = Path(TensorBoardOptions().build(str(directory)).log_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "events.out.tfevents.1").touch()
+        (directory / "checkpoints").mkdir(exist_ok=True)
+        (directory / "checkpoints" / "last.ckpt").touch()
+        return record_execution(run, directory, stats)
+
+    monkeypatch.setattr(train_verb, "train", log)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").mkdir()
+    for name in ("a/b", "c"):
+        (tmp_path / name).write_text("weights")
+    grid = ("ablation=full,neither", "evaluation.views=[3],[4]", "init_from=a/b,c")
+    shared = ("allow_random_encoder=true", "data.people.train=4")
+    assert sweep(*grid, *shared)[0] == 0
+    expected = {"ablation=full,init_from=a_b", "ablation=full,init_from=c"}
+    expected |= {name.replace("full", "neither") for name in expected}
+    found = sorted(sweep.directory.glob("*/tensorboard/*/events.*"))
+    assert (len(found), {path.parent.name for path in found}) == (8, expected)
+    for path in sweep.directory.glob("*/metrics.json"):
+        path.unlink()
+    assert sweep("ablation=full", "evaluation.views=[3],[4]", "init_from=a/b,c", *shared)[0] == 0
+    assert sorted(sweep.directory.glob("*/tensorboard/*/events.*")) == found
 
 
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
