@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.camera_errors import add_camera_errors
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
 from ghgs_capture.prediction import predict, trained_size
@@ -58,8 +57,7 @@ _PIECES = {"mask_hole_chance": 1.0}
 
 @dataclass(frozen=True)
 class Imperfection:
-    """Difference of a capture: ``data.rig.variation``, positions of inputs, and :class:`Augmentation` with
-    the maximum error ``calibration`` of cameras in pixels.
+    """Difference of a capture: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`.
 
     Photographs have exact mattes, or ``masks`` of 0 and 1, dilated by ``grown`` pixels. ``bumped``:
     the only camera with a wrong calibration; None: all are wrong. The first camera is turned by
@@ -179,15 +177,11 @@ def photograph(capture: Imperfection, batch: Batch) -> Capture:
     """Capture of one subject, composed with a background, from images on black."""
     subject = batch.subjects[0]
     limits = {k: v * (_LARGER if k in _PIXELS else 1) for k, v in capture.augmentation.items()}
-    error = limits.pop("calibration", 0)
     colors = Augmentation(**{k: v for k, v in limits.items() if k in _COLORS})
     seen, wrong = (
         augmentation.add_imperfections(batch, [subject_rng(0, subject)])
         for augmentation in (colors, Augmentation(**limits))
     )
-    if error:
-        cameras = add_camera_errors(batch, error, [subject_rng(0, subject)]).cameras
-        wrong = dataclasses.replace(wrong, cameras=cameras)
     behind = sample_backgrounds(_VIEWS, *batch.masks.shape[2:], subject_rng(1, subject))
     images = seen.images + (1 - batch.alpha[:, :, None]) * torch.from_numpy(behind).float()
     images[:, 0] **= capture.gamma

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from benchmarks.camera_errors import perturb_cameras
+from ghgs_lit.data.imperfections import perturb_cameras
 from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.unprojection import Unprojection, seen_surfaces
 from ghgs_lit.method.encoder.block import rotary_tables, run_block

@@ -15,10 +15,18 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Count, Options, Positive, Share
-from ghgs_lit.data.imperfections import perturb_mask, sample_backgrounds, sample_color_gains
+from ghgs_lit.config.options import Amount, Count, Options, Positive, Share
+from ghgs_lit.data.imperfections import (
+    change_tones,
+    cut_subjects,
+    perturb_cameras,
+    perturb_mask,
+    sample_backgrounds,
+    sample_color_gains,
+    sample_tone_powers,
+)
 from ghgs_lit.data.matting import refine_matte
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Cameras
 
 # Keys of random streams, in addition to those of ghgs_lit.data.sampling.
 _SIZES = 3
@@ -36,7 +44,9 @@ Pixels = Annotated[float, Field(ge=0, le=64)]
 
 class Augmentation(Options):
     """Augmentation of training batches; null and 0: none. Pixels are those of the inputs at their
-    sampled size. Targets stay unchanged."""
+    sampled size. Targets keep their colours and cameras, except that principal points move with cut
+    subjects. Depth maps keep the z-depths in the true cameras: the depth loss compares with the true
+    distance of the surface, not with one that compensates for the error of a camera."""
 
     group = "augmentation"
 
@@ -55,6 +65,11 @@ class Augmentation(Options):
     """Maximum deviation of the exposure of single cameras, in stops; 16 span black to white."""
     white_balance: Stops = 0.0
     """Maximum deviation of red and of blue of single cameras, in stops."""
+    gamma: Share = 0.0
+    """Maximum natural logarithm of the power to which single cameras raise colours, as their tone
+    curve."""
+    cut: Share = 0.0
+    """Share of the samples whose feet or legs are outside the frame, in all images or in some."""
     mask_offset: Pixels = 0.0
     """Maximum growth or shrinkage of masks in pixels; inputs are then black outside them."""
     mask_ragged: Pixels = 0.0
@@ -67,6 +82,8 @@ class Augmentation(Options):
     too large; the others are on black."""
     refined: Share = 0.0
     """Share of the samples with a background whose masks are then refined, as by refine_masks."""
+    calibration: Amount = 0.0
+    """Maximum error of the input cameras in pixels."""
 
     @model_validator(mode="after")
     def _check(self) -> "Augmentation":
@@ -78,11 +95,8 @@ class Augmentation(Options):
     @property
     def changes_photographs(self) -> bool:
         """Whether the pixels of an input image can differ between steps."""
-        return self.sizes is not None or (self.chance > 0 and self._is_imperfect)
-
-    @property
-    def _is_imperfect(self) -> bool:
-        return any((self.exposure, self.white_balance, *self._of_masks))
+        limits = (self.exposure, self.white_balance, self.gamma, self.cut, *self._of_masks)
+        return self.sizes is not None or (self.chance > 0 and any(limits))
 
     @property
     def _of_masks(self) -> tuple[float, float, float]:
@@ -127,8 +141,9 @@ class Augmentation(Options):
         Returns:
             The batch, unchanged in steps without imperfections; otherwise see :meth:`add_imperfections`.
         """
+        limits = (self.exposure, self.white_balance, self.gamma, self.cut, self.calibration, *self._of_masks)
         is_last = self.exact_from is not None and step >= self.exact_from
-        if is_last or not self._is_imperfect:
+        if is_last or not any(limits):
             return batch
         if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
             return batch
@@ -143,20 +158,34 @@ class Augmentation(Options):
             batch: a batch with at least two views.
             rngs: generator of each element; each kind of imperfection uses its own stream.
         """
-        colors, _, outlines, behind = zip(*(rng.spawn(4) for rng in rngs), strict=True)
+        streams = [rng.spawn(6) for rng in rngs]
+        if self.cut:
+            batch = cut_subjects(batch, self.cut, [s[4] for s in streams])
         images = batch.images
         masks = batch.masks
+        cameras = batch.cameras
         alpha = batch.alpha
         if self.exposure or self.white_balance:
-            limits = masks.shape[1], self.exposure, self.white_balance
-            gains = np.stack([sample_color_gains(*limits, rng) for rng in colors])
-            images = (images * torch.from_numpy(gains).to(images)[..., None, None]).clamp(0, 1)
+            views = masks.shape[1]
+            gains = [sample_color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
+            images = (images * torch.from_numpy(np.stack(gains)).to(images)[..., None, None]).clamp(0, 1)
+        if self.gamma:
+            powers = np.stack([sample_tone_powers(masks.shape[1], self.gamma, s[5]) for s in streams])
+            images = change_tones(images, alpha, torch.from_numpy(powers).to(images))
+        if self.calibration:
+            wrong = [
+                perturb_cameras(cameras[b], masks[b], self.calibration, s[1]) for b, s in enumerate(streams)
+            ]
+            matrices = zip(*((one.intrinsics, one.extrinsics) for one in wrong), strict=True)
+            cameras = Cameras(*map(torch.stack, matrices), cameras.height, cameras.width)
         if any(self._of_masks):
             known = masks.to(images) if alpha is None else alpha
-            segmented = map(self._segment, images, masks, known, outlines, behind)
+            segmented = [
+                self._segment(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
+            ]
             images, masks, mattes = (torch.stack(parts) for parts in zip(*segmented, strict=True))
             alpha = None if alpha is None else mattes
-        return dataclasses.replace(batch, images=images, masks=masks, alpha=alpha)
+        return dataclasses.replace(batch, images=images, masks=masks, cameras=cameras, alpha=alpha)
 
     def _segment(
         self,

@@ -1,7 +1,5 @@
 """Augmentation of training batches: effects of each option, and dependence on seed and step only."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -9,13 +7,16 @@ import torch
 from ghgs_lit.config import compose
 from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
+from ghgs_lit.data.imperfections import cut_subjects
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.types import Batch
 from tests.helpers.people import RELEASE, V4, equal, rendered
 
 RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "uneven"}
 IMPERFECT = {
-    "exposure": 0.5, "white_balance": 0.2, "mask_offset": 1.5, "mask_ragged": 1.0, "mask_hole_chance": 0.5,
+    "exposure": 0.5, "white_balance": 0.2, "gamma": 0.3, "mask_offset": 1.5, "mask_ragged": 1.0,
+    "mask_hole_chance": 0.5, "calibration": 2.0,
 }  # fmt: skip
 EVERYTHING = IMPERFECT | {"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
 
@@ -59,6 +60,9 @@ def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
     first = drawn(0, 3)
     assert equal(first, drawn(0, 3))
     for other in (drawn(1, 3), drawn(0, 6), drawn(0, 3, (8, 9))):
+        for name in ("intrinsics", "extrinsics"):
+            one, two = (getattr(batch.cameras, name) for batch in (first, other))
+            assert (one != two).flatten(1).any(1).all()
         assert (first.images != other.images).flatten(1).any(1).all()
     sizes = [
         [varied.sample_sizes((28, 28), (56, 56), seed, step) for step in range(12)] for seed in (0, 0, 1)
@@ -133,40 +137,43 @@ def test_the_last_part_of_a_run_is_exact(boxes):
 
 def find_differences(a, b) -> set[str]:
     """Names of the fields in which two batches differ."""
-    names = (field.name for field in dataclasses.fields(a))
-    return {name for name in names if not equal_values(getattr(a, name), getattr(b, name))}
-
-
-def equal_values(x, y) -> bool:
-    if dataclasses.is_dataclass(x):
-        return equal(x, y)
-    if isinstance(x, list):
-        return all(map(torch.equal, x, y))
-    return torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y
+    cameras = {
+        f"cameras.{name}": (getattr(a.cameras, name), getattr(b.cameras, name))
+        for name in ("intrinsics", "extrinsics")
+    }
+    names = ("images", "masks", "depths", "alpha")
+    tensors = {name: (getattr(a, name), getattr(b, name)) for name in names} | cameras
+    found = {name for name, (x, y) in tensors.items() if not torch.equal(x, y)}
+    return found | ({"targets"} if not equal(a.targets, b.targets) else set())
 
 
 @pytest.mark.parametrize(
-    ("name", "changed"),
+    ("names", "changed"),
     [
-        ("exposure", {"images"}),
-        ("white_balance", {"images"}),
-        ("mask_offset", {"images", "masks", "alpha"}),
-        ("mask_ragged", {"images", "masks", "alpha"}),
-        ("mask_hole_chance", {"images", "masks", "alpha"}),
+        (("exposure",), {"images"}),
+        (("white_balance",), {"images"}),
+        (("gamma",), {"images"}),
+        (("mask_offset",), {"images", "masks", "alpha"}),
+        (("mask_ragged",), {"images", "masks", "alpha"}),
+        (("mask_hole_chance",), {"images", "masks", "alpha"}),
+        (("calibration",), {"cameras.intrinsics", "cameras.extrinsics"}),
     ],
 )
-def test_each_imperfection_changes_its_part_of_the_inputs_alone(boxes, name, changed):
-    """Targets, cameras, depths and other inputs stay unchanged."""
-    clean, batch, together = (
-        module(boxes, augmentation=a).training_batch(1) for a in ({}, {name: IMPERFECT[name]}, IMPERFECT)
-    )
+def test_each_imperfection_changes_its_part_of_the_inputs_alone(boxes, names, changed):
+    """Targets, depths and other inputs stay unchanged, and each imperfection acts alone as in combination."""
+    chosen = {name: IMPERFECT[name] for name in names}
+    clean, batch = (module(boxes, augmentation=a).training_batch(1) for a in ({}, chosen))
     assert find_differences(clean, batch) == changed
-    assert find_differences(clean, together) == {"images", "masks", "alpha"}
+    together = module(boxes, augmentation=IMPERFECT).training_batch(1)
+    everything = {"images", "masks", "alpha", "cameras.intrinsics", "cameras.extrinsics"}
+    assert find_differences(clean, together) == everything
     # The matte follows the mask: 0 outside it, and 1 where the mask was enlarged.
     assert not together.alpha[~together.masks].any()
     assert (together.alpha[together.masks & ~clean.masks] == 1).all()
     kept = together.masks & clean.masks
     assert torch.equal(together.alpha[kept], clean.alpha[kept])
+    if names == ("calibration",):
+        assert "cameras.extrinsics" not in find_differences(batch, together)
     for one in (batch, together):
         assert one.images.min() >= 0
         assert one.images.max() <= 1
@@ -205,6 +212,52 @@ def test_refined_masks_are_those_of_a_capture(boxes):
     assert equal(found.targets, clean.targets)
 
 
+def test_tone_curves_raise_the_surface_to_a_power(boxes):
+    """Each camera has one power, powers differ with a geometric mean of 1, and black and mattes stay."""
+    clean, toned = (module(boxes, augmentation=a).training_batch(1) for a in ({}, {"gamma": 0.3}))
+    one, other = (surface_colors(batch).double() for batch in (clean, toned))
+    sure = ((clean.alpha > 0.5)[:, :, None] & (one > 0.1) & (one < 0.9)).expand_as(one)
+    powers = torch.where(sure, other.log() / one.log(), torch.nan).flatten(2)
+    for b, v in np.ndindex(*powers.shape[:2]):
+        values = powers[b, v][~powers[b, v].isnan()]
+        torch.testing.assert_close(values, values.median().expand_as(values), rtol=1e-3, atol=1e-3)
+    logs = powers.nanmedian(-1).values.log()
+    assert logs.abs().max() < 0.301
+    assert (logs.amax(1) - logs.amin(1) > 0.05).all()
+    torch.testing.assert_close(logs.mean(1), torch.zeros(len(logs)).double(), rtol=0, atol=1e-3)
+
+
+def test_a_cut_moves_photographs_and_cameras_together(boxes):
+    """World points keep their colours until they leave the frame, and subjects that are not cut everywhere
+    stay whole in some view."""
+    clean = module(boxes).training_batch(1)
+    kinds = set()
+    for seed in range(12):
+        rngs = [np.random.default_rng([seed, b]) for b in range(2)]
+        batch = cut_subjects(clean, 1.0, rngs)
+        rows = batch.cameras.intrinsics[..., 1, 2] - clean.cameras.intrinsics[..., 1, 2]
+        lower = batch.targets.cameras.intrinsics[..., 1, 2] - clean.targets.cameras.intrinsics[..., 1, 2]
+        for name in ("images", "masks", "depths", "alpha"):
+            before, after = getattr(clean, name), getattr(batch, name)
+            for b, v in np.ndindex(*rows.shape):
+                down = int(rows[b, v])
+                assert torch.equal(
+                    after[b, v][..., down:, :], before[b, v][..., : before.shape[-2] - down, :]
+                )
+                assert not after[b, v][..., :down, :].any()
+        left = batch.masks.sum((2, 3)) / clean.masks.sum((2, 3))
+        assert (left > 0.2).all()
+        for b in range(2):
+            everywhere = bool((lower[b] > 0).any())
+            kinds.add(everywhere)
+            assert bool((rows[b] > 0).all()) == everywhere
+            assert bool((lower[b] > 0).all()) == everywhere
+            assert (rows[b] > 0).any()
+            assert everywhere or (left[b] == 1).any()
+    assert kinds == {True, False}
+    assert equal(cut_subjects(clean, 0.0, [np.random.default_rng(b) for b in range(2)]), clean)
+
+
 def test_imperfections_do_not_depend_on_batch_mates(boxes):
     """Two elements in a batch get the same imperfections as each alone."""
     batch = module(boxes).training_batch(0)
@@ -221,6 +274,7 @@ def test_imperfections_do_not_depend_on_batch_mates(boxes):
         alone = perturb(element(batch, b), (seed,))
         assert torch.equal(alone.images[0], both.images[b])
         assert torch.equal(alone.masks[0], both.masks[b])
+        assert torch.equal(alone.cameras.extrinsics[0], both.cameras.extrinsics[b])
 
 
 def test_validation_does_not_vary(boxes):
@@ -249,7 +303,9 @@ def test_shipped_variation_is_built():
         ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
         ({"chance": 1.5}, "augmentation.chance: expected a number >= 0 and <= 1; found 1.5"),
         ({"background": 2}, "augmentation.background: expected a number >= 0 and <= 1; found 2"),
-        ({"mask_offset": -1}, "augmentation.mask_offset: expected a number >= 0 and <= 64; found -1"),
+        ({"gamma": 1e9}, "augmentation.gamma: expected a number >= 0 and <= 1; found"),
+        ({"cut": 2}, "augmentation.cut: expected a number >= 0 and <= 1; found 2"),
+        ({"calibration": -1}, "augmentation.calibration: expected a number >= 0; found -1"),
         ({"mask_holes": 1}, "augmentation.mask_holes: .*did you mean mask_hole_chance"),
     ],
 )

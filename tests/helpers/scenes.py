@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
-from benchmarks.camera_errors import perturb_cameras
+from ghgs_lit.data.imperfections import perturb_cameras
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, Cameras, Gaussians, Targets
 from tests.helpers.cameras import camera_ring

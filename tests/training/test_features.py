@@ -172,15 +172,15 @@ def test_it_says_how_much_room_it_needs_before_it_writes(tmp_path, caplog, monke
 
 
 def test_it_is_off_where_each_step_sees_other_photographs(tmp_path, caplog):
-    """It stays on if augmentation changes only the sizes of targets."""
+    """It stays on if augmentation changes only cameras."""
     caplog.set_level(logging.INFO)
     model = SimpleNamespace(encoder=make_encoder(**SMALL_VGGT))
     options = DiskFeatureCache(folder=tmp_path)
-    for augmentation in ({"exposure": 0.3}, {"sizes": ((42, 42), (56, 56))}, {"mask_offset": 1.0}):
+    for augmentation in ({"exposure": 0.3}, {"sizes": ((42, 42), (56, 56))}, {"cut": 0.1}):
         options.attach(model, data_of(**augmentation))
         assert model.encoder.aggregator.patch_embed.cache is None
     assert caplog.text.count("feature_cache: off") == 3
-    options.attach(model, data_of(target_scale=(0.7, 2.0)))
+    options.attach(model, data_of(calibration=2.0))
     assert model.encoder.aggregator.patch_embed.cache is not None
 
 
