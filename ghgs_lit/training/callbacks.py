@@ -9,7 +9,7 @@ import lightning.pytorch as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, Timer
-from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Column
@@ -187,9 +187,6 @@ def _publish(trainer: L.Trainer, name: str, picture: np.ndarray) -> None:
     """Write a subject's picture [h, w, 3] uint8 to ``<run>/pictures/step_<step>/<name>.png``, and log it."""
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{name}.png")
-    tag = f"view/sheet/{name}"
     for logger in trainer.loggers:
         if isinstance(logger, TensorBoardLogger):
-            logger.experiment.add_image(tag, picture, step, dataformats="HWC")
-        elif isinstance(logger, WandbLogger):
-            logger.log_image(tag, [picture])
+            logger.experiment.add_image(f"view/sheet/{name}", picture, step, dataformats="HWC")

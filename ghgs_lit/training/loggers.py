@@ -1,22 +1,19 @@
 """Loggers that continue after a restart, and the values logged for the comparison of runs."""
 
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.tensorboard.summary import hparams
 
 from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.options import Options
-from ghgs_lit.errors import import_optional
 from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
 from ghgs_lit.runs.job import find_curves
-from ghgs_lit.runs.run import RunDirectory
 
 #: Metrics by which runs are compared; ``metrics.json`` contains all.
 COMPARED = ("psnr", "ssim", "depth_error_mm")
@@ -110,34 +107,6 @@ class TensorBoardOptions(Options):
         return TensorBoardLog(find_curves(Path(save_dir)), name="", version="")
 
 
-class WandbLog(WandbLogger):
-    """Weights & Biases logger: one W&B run per run, however often it is interrupted or moved."""
-
-    @rank_zero_only
-    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log values at the number of steps taken. Steps that are trained again do not replace values.
-
-        Args:
-            step: Lightning's step, one less than the number of steps taken."""
-        taken = None if step is None else step + 1
-        self.experiment.log({**metrics, "trainer/global_step": taken}, step=taken)
-
-
-class WandbOptions(Options):
-    """Weights & Biases (extra ``wandb``), configured by the environment variables ``WANDB_PROJECT`` and
-    ``WANDB_MODE``."""
-
-    def build(self, save_dir: str) -> WandbLog:
-        """Create the logger of the run in ``save_dir``.
-
-        Raises:
-            InputError: the extra is not installed."""
-        import_optional("wandb", "wandb", "logger.wandb")
-        project = os.environ.get("WANDB_PROJECT", "ghgs_lit")
-        identity = RunDirectory(Path(save_dir)).marker
-        return WandbLog(project=project, save_dir=save_dir, id=identity and identity.id)
-
-
 @rank_zero_only
 def begin(loggers: Sequence[Logger], config: str, step: int | None) -> None:
     """Begin the logs of a run, or continue those in its folder.
@@ -188,8 +157,6 @@ def close(loggers: Sequence[Logger]) -> None:
         # Reading ``experiment`` would start loggers that were never used.
         if isinstance(logger, TensorBoardLogger) and logger._experiment is not None:
             logger._experiment.close()
-        elif isinstance(logger, WandbLogger) and logger._experiment is not None:
-            logger._experiment.finish()
 
 
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:

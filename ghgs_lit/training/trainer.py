@@ -3,7 +3,6 @@
 from typing import Annotated, Any, Literal
 
 import lightning.pytorch as L
-from lightning.pytorch.profilers import SimpleProfiler
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
@@ -55,8 +54,6 @@ class TrainerOptions(Options):
     """Batches whose gradients each step accumulates."""
     deterministic: bool | Literal["warn"] = False
     """true: use deterministic operations only, and raise where PyTorch has none; warn: warn there."""
-    profiler: Literal["simple"] | None = None
-    """Lightning's profiler, which writes the times of hooks to <run>/fit-profile.txt."""
 
     def build(self, **arguments: Any) -> L.Trainer:
         """Build a Trainer that counts validations in steps and has no limit of epochs.
@@ -77,8 +74,6 @@ class TrainerOptions(Options):
         if not (alone and self.num_nodes == 1):
             # Not every parameter has a gradient in every step (ablations, skipped work).
             options["strategy"] = "ddp_find_unused_parameters_true"
-        if self.profiler is not None:  # written to a file, as Lightning's log lines are silenced
-            options["profiler"] = SimpleProfiler(arguments.get("default_root_dir"), "profile")
         try:
             return L.Trainer(
                 **options,

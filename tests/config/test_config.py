@@ -22,7 +22,7 @@ from tests.helpers.verbs import refuse, succeed
 CONF = conf_dir()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 #: Packages that an option requires, and the extra that installs them.
-NEEDS = {"logger.wandb": ("wandb", "wandb"), "metrics=release": ("torchvision", "lpips")}
+NEEDS = {"metrics=release": ("torchvision", "lpips")}
 
 
 def nodes_with_kind(node, key=""):

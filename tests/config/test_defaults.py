@@ -53,14 +53,14 @@ def test_a_composed_configuration_has_every_key(group):
 @pytest.mark.parametrize(
     ("override", "key", "value"),
     [
-        ("trainer.profiler=simple", "trainer.profiler", "simple"),
-        ("+trainer.profiler=simple", "trainer.profiler", "simple"),
-        ("++trainer.profiler=simple", "trainer.profiler", "simple"),
+        ("trainer.deterministic=warn", "trainer.deterministic", "warn"),
+        ("+trainer.deterministic=warn", "trainer.deterministic", "warn"),
+        ("++trainer.deterministic=warn", "trainer.deterministic", "warn"),
         ("gaussian_head.attributes.inward=0.25", "gaussian_head.attributes.inward", 0.25),
         ("optimizer.freeze_until.encoder=0.5", "optimizer.freeze_until.encoder", 0.5),
         ("callbacks.pictures.subjects=2", "callbacks.pictures.subjects", 2),
         # a key that no file sets
-        ("trainer.profiler=${data.resampling}", "trainer.profiler", "area"),
+        ("trainer.deterministic=${data.resampling}", "trainer.deterministic", "area"),
     ],
 )
 def test_a_key_that_no_file_says_can_be_set(override, key, value):

@@ -85,7 +85,7 @@ def test_every_number_has_a_limit_or_can_do_no_harm():
 @pytest.fixture(scope="module")
 def whole():
     """A configuration with every group."""
-    cfg = composed("train", "model=recurrent", "logger=wandb")
+    cfg = composed("train", "model=recurrent")
     return OmegaConf.to_container(cfg, resolve=True)
 
 

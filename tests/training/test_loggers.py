@@ -1,7 +1,6 @@
 """Contents of TensorBoard and CSV logs (tags, pictures, HParams), and their continuation."""
 
 import csv
-import importlib.util
 import threading
 import time
 import warnings
@@ -12,9 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from ghgs_lit.config import build, run_of
-from ghgs_lit.errors import InputError
-from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.config import build
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import PicturesOptions
 from ghgs_lit.training.loggers import (
@@ -186,23 +183,6 @@ def test_a_kill_loses_nothing_that_was_logged(tmp_path):
     close([curves])
 
 
-def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
-    """Resumed and moved runs keep their W&B id; another run in the same directory gets a new one."""
-    seen = []
-    monkeypatch.setattr("ghgs_lit.training.loggers.import_optional", lambda *_: None)
-    monkeypatch.setattr("ghgs_lit.training.loggers.WandbLog", lambda **options: seen.append(options["id"]))
-    config = run_of("train", ["seed=1", "resume=auto"])
-    for folder, overwrite in (("a", False), ("a", False), ("b", False), ("b", True)):
-        if folder == "b" and not overwrite:
-            (tmp_path / "a").rename(tmp_path / "b")
-        run = RunDirectory(tmp_path / folder)
-        with run.claim():
-            run.begin(config.replace(overwrite=overwrite))
-        build({"kind": "wandb"}, "logger.wandb", save_dir=str(run.path))
-    assert seen[0] == seen[1] == seen[2] != seen[3]
-    assert len(seen[0]) == 8
-
-
 def test_runs_of_a_sweep_leave_no_threads(tmp_path):
     """Otherwise each run of a long sweep would leak TensorBoard's writer and its memory."""
     before = threading.active_count()
@@ -245,9 +225,3 @@ def test_final_numbers_name_their_protocol():
     ]
     expected = {"measured/psnr_v4_release": 30.0, "measured/psnr_v4_midway": 28.0}
     assert final_numbers(summary) == expected
-
-
-def test_wandb_names_its_extra_where_it_is_not_installed(tmp_path):
-    if importlib.util.find_spec("wandb") is None:
-        with pytest.raises(InputError, match=r"logger\.wandb.*ghgs-lit\[wandb\]"):
-            build({"kind": "wandb"}, "logger.wandb", save_dir=str(tmp_path))

@@ -1,4 +1,4 @@
-"""Common options of Lightning's Trainer work (time, accumulation, profiler, processes, precisions), and
+"""Common options of Lightning's Trainer work (time, accumulation, processes, precisions), and
 a seed reproduces losses bit for bit."""
 
 import lightning.pytorch as L
@@ -64,12 +64,6 @@ def test_a_training_ends_when_its_time_is_up(tmp_path):
     """Lightning ignores ``max_time`` next to a callback that is a Timer."""
     trainer, _ = fit(tmp_path, max_steps=-1, max_time={"seconds": 1}, limit_val_batches=0)
     assert trainer.global_step > 0
-
-
-def test_a_profile_is_a_file_of_the_run(tmp_path):
-    """The profile is written to a file, as Lightning's log lines are silenced."""
-    fit(tmp_path, profiler="simple", max_steps=2)
-    assert "optimizer_step" in (tmp_path / "fit-profile.txt").read_text()
 
 
 def test_options_of_lightning_reach_it(monkeypatch):
