@@ -120,7 +120,6 @@ class GraphCache:
         function: Callable[[Any], Result],
         inputs: Any,
         key: Hashable = (),
-        written: Sequence[Tensor] = (),
     ) -> Result:
         """Return ``function(inputs)``, without a gradient.
 
@@ -131,8 +130,6 @@ class GraphCache:
             inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
                 hashable.
             key: everything else that may change what ``function`` does.
-            written: previously allocated memory that ``function`` writes to; a capture leaves it
-                unchanged.
 
         Returns:
             The result, in memory that later calls do not overwrite.
@@ -148,14 +145,14 @@ class GraphCache:
                     self._graphs.move_to_end(bucket)
                     self.counts["replayed"] += 1
                 elif self._is_due(bucket):
-                    graph = self._capture(bucket, function, inputs, tensors, written)
+                    graph = self._capture(bucket, function, inputs, tensors)
                 else:
                     self.counts["eager"] += 1
                 if graph is not None:
                     return _replay(graph, tensors)
         else:
             self.counts["eager"] += 1
-        return self._call_eagerly(function, inputs, written)
+        return retry_without_graphs(lambda: function(inputs))
 
     def _is_due(self, bucket: Hashable) -> bool:
         """Note a call of a bucket, and return whether it had its eager call before."""
@@ -174,7 +171,6 @@ class GraphCache:
         function: Callable,
         inputs: Any,
         tensors: list[Tensor],
-        written: Sequence[Tensor],
     ) -> "_Graph | None":
         """Capture a new graph; None if that fails. Arguments as for :meth:`__call__`."""
         graph = None
@@ -182,7 +178,7 @@ class GraphCache:
         try:
             # Streams and graphs belong to the current GPU.
             with torch.cuda.device_of(tensors[0]):
-                graph = _capture_function(self.backend, function, inputs, written)
+                graph = _capture_function(self.backend, function, inputs)
         except torch.OutOfMemoryError:
             is_full = True
         except Exception as error:  # drivers fail in many ways
@@ -203,15 +199,6 @@ class GraphCache:
         self.counts["refused"] += 1
         self._refused.add(bucket)
         self.note(reason)
-
-    def _call_eagerly(
-        self, function: Callable[[Any], Result], inputs: Any, written: Sequence[Tensor]
-    ) -> Result:
-        """``function(inputs)``, repeated without graphs if memory runs out; not with ``written`` memory,
-        since such a call cannot be repeated."""
-        if written:
-            return function(inputs)
-        return retry_without_graphs(lambda: function(inputs))
 
     def _bucket(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
         """Key of the graphs that are valid for a call; None if it is not hashable. Appends the tensors of
@@ -294,10 +281,8 @@ def _replace_tensors(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
     return replace(value) if isinstance(value, Tensor) else value
 
 
-def _capture_function(
-    backend: CaptureBackend, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]
-) -> _Graph:
-    """Capture ``function(inputs)`` on copies of the inputs, and restore ``written`` afterwards.
+def _capture_function(backend: CaptureBackend, function: Callable[[Any], Any], inputs: Any) -> _Graph:
+    """Capture ``function(inputs)`` on copies of the inputs.
 
     Raises:
         NotCapturable: the function reads a value of the device or copies from the host.
@@ -320,13 +305,10 @@ def _capture_function(
         with checks[-1]:
             return function(fresh)
 
-    values = [tensor.clone() for tensor in written]
     try:
         result, replay = backend.capture(call_checked)
     finally:
         torch.clear_autocast_cache()  # casts from a failed capture were never computed
-        with torch.no_grad():
-            _copy_all(written, values)
     return _Graph(places, result, replay, list(checks[-1].kept.values()))
 
 
