@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.execution import Predictor
 from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 
@@ -59,13 +58,3 @@ def test_broken_values_are_refused_where_they_are(changes, message):
     model = make_model("model=paper")
     with pytest.raises(InputError, match=message):
         predict(model, batch)
-
-
-def test_checks_of_values_can_be_left_out():
-    """Checks can be disabled for values that are already checked; by default the model rejects invalid
-    ones."""
-    bad = dataclasses.replace(make_batch(1, 2), **spoil("images", (0, 1, 2, 0, 0), torch.nan))
-    model = make_model("model=paper")
-    with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
-        predict(model, bad)
-    Predictor(model, checks_values=False)(bad)

@@ -91,10 +91,10 @@ def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
 
 #: Launches outside the graphs of a training step, and synchronizations, by model and batch size.
 AROUND = {
-    ("shipped", 1): (30, 2),
-    ("shipped", 8): (30, 2),
-    ("model=paper", 1): (30, 2),
-    ("model=paper", 8): (30, 2),
+    ("shipped", 1): (29, 2),
+    ("shipped", 8): (29, 2),
+    ("model=paper", 1): (29, 2),
+    ("model=paper", 8): (29, 2),
 }
 
 
@@ -110,13 +110,12 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
         model = two_rounds(kind).to(DEVICE).train()
         captured = CapturedStep(Predictor(model), Renderer(), losses)
         captured.graphs, captured.predictor.graphs = (GraphCache(backend=SilentBackend()) for _ in range(2))
-        options = Optimization(lr=1e-3)
         for _ in range(4):
             depths = 2.0 * batch.masks
             there = dataclasses.replace(batch, depths=depths, body_vertices=bodies).to(DEVICE)
             log.clear()
             captured(there).total.backward()
-            options.clip_gradients(model)
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0, foreach=True)
             model.zero_grad()
     found = (log.launches, log.waits.total())
     print(found)

@@ -13,7 +13,6 @@ from ghgs_lit import GHGS
 from ghgs_lit.config import registry, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.ply import read_ply
-from ghgs_lit.training import GHGSModule
 from tests.helpers.figures import Figure
 from tests.helpers.models import TINY, load_model, predict
 from tests.helpers.people import render_boxes
@@ -101,8 +100,6 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     if group == "loss":
         saved = torch.load(checkpoint)["state_dict"]
         assert saved["losses.log_variance"] != 0  # differs from its initial value
-        read = GHGSModule.load_from_checkpoint(checkpoint).losses.state_dict()
-        assert all(torch.equal(value, saved[f"losses.{name}"]) for name, value in read.items())
         assert "largest" in measured["provenance"]["protocol"]["reported"]
         assert all(0 < row["largest"] <= 1 for row in measured["rows"])
         said.remove("metrics=mine")

@@ -2,15 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 from ghgs_capture.camera_report import diagnose
 from ghgs_capture.verbs.photographs import capture_folder
 from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.cli.runtime import output_dir, write_config
-from ghgs_lit.diagnostics.machine import machine_lines, missing_extras
+from ghgs_lit.diagnostics.machine import machine_lines
 from ghgs_lit.errors import InputError, require
 
 if TYPE_CHECKING:
@@ -43,13 +39,6 @@ def cameras(run: "Doctor") -> None:
 
 
 def machine(run: "Doctor") -> None:
-    """Print what this machine has, for ``run.device``, and which features lack a package or device."""
-    console = Console(soft_wrap=True)
-    for title, lines in (
-        ("This machine", machine_lines(pick_device(run.device))),
-        ("Extras that are not installed", list(missing_extras()) or [("none", "")]),
-    ):
-        listing = Table("", "", title=title, title_justify="left", show_header=False, box=None)
-        for line in lines:
-            listing.add_row(*map(escape, line))
-        console.print(listing)
+    """Print what this machine has, for ``run.device``."""
+    for name, text in machine_lines(pick_device(run.device)):
+        print(f"{name:18}{text}")

@@ -164,7 +164,7 @@ class Import(Verb):
 
 
 class Export(Verb):
-    """Convert a checkpoint to a small one for prediction, or to the published format."""
+    """Convert a checkpoint to a small one for prediction."""
 
     work = "ghgs_lit.cli.weights.run_export"
     example = "ghgs export checkpoint=checkpoints/last.ckpt inference=small.ckpt"
@@ -172,13 +172,9 @@ class Export(Verb):
 
     checkpoint: PathText
     """Checkpoint of ``ghgs train`` or ``ghgs import``."""
-    vggt: PathText | None = None
-    """File for the encoder, .safetensors or .pt; null: not written."""
-    release: PathText | None = None
-    """File for all other stages, .pth; null: not written."""
-    inference: PathText | None = None
-    """File with only weights and configuration, a checkpoint for ``ghgs predict``; null: not written."""
+    inference: PathText
+    """File with only weights and configuration, a checkpoint for ``ghgs predict``."""
     dtype: Literal["float16", "bfloat16", "float32"] = "float16"
-    """Data type of the weights in the inference file."""
+    """Data type of its weights."""
     overwrite: bool = False
-    """Replace existing files."""
+    """Replace an existing file."""

@@ -1,4 +1,4 @@
-"""``ghgs import`` and ``ghgs export``: convert published weights to a checkpoint and back."""
+"""``ghgs import`` and ``ghgs export``: published weights to a checkpoint, and a checkpoint to a small one."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -7,10 +7,9 @@ from torch import Tensor
 
 from ghgs_lit.cli.inputs import MODEL_NODES
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_config
-from ghgs_lit.errors import require
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.weights.checkpoint import read_config, write_inference
-from ghgs_lit.weights.published import export_weights, import_weights
+from ghgs_lit.weights.checkpoint import write_inference
+from ghgs_lit.weights.published import import_weights
 from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
 
@@ -48,24 +47,14 @@ def run_import(verb: "Import") -> None:
 
 
 def run_export(verb: "Export") -> None:
-    """Write the requested files, and print how the model differs from the release.
+    """Write the checkpoint for prediction, and print both sizes.
 
     Raises:
-        InputError: No file is requested, a file exists, or the checkpoint is wrong.
+        InputError: The file exists, or the checkpoint is wrong.
     """
     write_config(verb, output_dir())
-    checkpoint = verb.checkpoint
-    keys = ("vggt", "release", "inference")
-    paths = files_to_write(verb, keys, [file_of(checkpoint)])
-    vggt, release, inference = map(paths.get, keys)
-    require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
-    if vggt is not None or release is not None:
-        print("\n".join(export_weights(checkpoint, vggt, release)), flush=True)
-        differing = differences(read_config(checkpoint))
-        if release is not None and differing:
-            print(f"differs from the release: {', '.join(differing)}", flush=True)
-    if inference is not None:
-        write_inference(checkpoint, inference, verb.dtype)
-        sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
-        print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
-    announce(paths.popitem()[1])
+    path = files_to_write(verb, ["inference"], [file_of(verb.checkpoint)])["inference"]
+    write_inference(verb.checkpoint, path, verb.dtype)
+    sizes = (file_of(each).stat().st_size / 1e6 for each in (verb.checkpoint, path))
+    print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
+    announce(path)

@@ -1,10 +1,7 @@
-"""Description of this machine, and the optional extras of the package that are not installed."""
+"""Description of this machine."""
 
-import importlib.metadata
 import os
 import platform
-import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -70,22 +67,6 @@ def machine_lines(device: torch.device) -> list[Line]:
         ("renderer", _gsplat_state()),
         ("compiled kernels", os.environ.get("NUMBA_CACHE_DIR") or "next to the package's sources"),
     ]
-
-
-def missing_extras() -> Iterator[Line]:
-    """Yield each extra of the package that is not fully installed, with the command that installs it."""
-    wanted: dict[str, list[str]] = {}
-    if version_of(DISTRIBUTION) is None:  # run from its sources
-        yield DISTRIBUTION, "not installed, so that its extras are not known: pip install -e ."
-        return
-    for requirement in importlib.metadata.requires(DISTRIBUTION) or []:
-        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if extra and extra[1] != "dev":
-            wanted.setdefault(extra[1], []).append(re.match(r"[\w.-]+", requirement)[0])
-    for extra, names in wanted.items():
-        absent = [name for name in names if version_of(name) is None]
-        if absent:
-            yield extra, f"{', '.join(absent)} missing: pip install '{DISTRIBUTION}[{extra}]'"
 
 
 def _gpus() -> list[Line]:

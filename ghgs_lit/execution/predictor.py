@@ -54,7 +54,6 @@ class Predictor:
         model: the stages.
         options: options of pre- and postprocessing; None: those of the model's configuration.
         precision: precision of products, one of :data:`ghgs_lit.geometry.precision.PRECISIONS`.
-        checks_values: reject input views, depths and bodies with NaN or values out of range.
 
     Attributes:
         graphs: captured graphs, at most two per shape bucket.
@@ -63,18 +62,11 @@ class Predictor:
         InputError: an option or the precision is unknown.
     """
 
-    def __init__(
-        self,
-        model: GHGS,
-        options: ModelOptions | None = None,
-        precision: str = "inherit",
-        checks_values: bool = True,
-    ):
+    def __init__(self, model: GHGS, options: ModelOptions | None = None, precision: str = "inherit"):
         require_choice("precision", precision, PRECISIONS)
         self.model = model
         self.options = options or ModelOptions.read(model.config.get("model") or {}, "model")
         self.precision = precision
-        self.checks_values = checks_values
         self.graphs = GraphCache(limit=16)
 
     @classmethod
@@ -163,7 +155,7 @@ class Predictor:
 
     def _enter(self, batch: Batch) -> tuple[Batch, Preprocessing, list[Finding], MaskStatistics]:
         patch_size = self.model.encoder.patch_size
-        inside, done, findings = preprocess(batch, self.options, patch_size, self.checks_values)
+        inside, done, findings = preprocess(batch, self.options, patch_size)
         return inside, done, findings, self.model.measure(inside, [any_bad(findings)])
 
     def _enter_captured(
@@ -176,7 +168,7 @@ class Predictor:
             return self._enter(batch)
         # Fresh cameras: cached values would put the same batch into another bucket the next time.
         bare = replace(batch, cameras=replace(batch.cameras), targets=None, subjects=(), views=())
-        key = ("enter", self.options, self.checks_values, state.encoder)
+        key = ("enter", self.options, state.encoder)
         with torch.no_grad():
             inside, *others = self.graphs(self._enter, bare, key)
         # Targets and names are not preprocessed.

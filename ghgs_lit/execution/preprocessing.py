@@ -30,20 +30,19 @@ _ROUNDING = 1e-3
 Finding = tuple[str, str, Tensor]
 
 
-def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Finding]:
+def findings_of(batch: Batch, patch_size: int) -> list[Finding]:
     """Check a batch without a device-to-host synchronisation; returns a finding per check, violated or
     not.
 
     Args:
         batch: its targets are not checked.
         patch_size: must divide height and width, in pixels.
-        values: also check every value: one NaN in the background would leave no Gaussian.
 
     Raises:
         InputError: a shape or a dtype is wrong.
     """
     _check_shapes(batch, patch_size)
-    return _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
+    return _findings_of_cameras(batch) + _findings_of_values(batch)
 
 
 def any_bad(findings: Sequence[Finding]) -> Bool[Tensor, ""]:
@@ -94,7 +93,7 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
 
 
 def _findings_of_cameras(batch: Batch) -> list[Finding]:
-    """Checks of cameras and masks, which are never skipped."""
+    """Checks of cameras and masks."""
     findings = []
     for name in ("intrinsics", "extrinsics"):
         matrices = getattr(batch.cameras, name)
@@ -106,7 +105,8 @@ def _findings_of_cameras(batch: Batch) -> list[Finding]:
 
 
 def _findings_of_values(batch: Batch) -> list[Finding]:
-    """Checks of every value of images, mattes, depths and bodies."""
+    """Checks of every value of images, mattes, depths and bodies: one NaN in the background would leave no
+    Gaussian."""
     within = "finite values within [0, 1]"
     findings = [("images", within, _beyond(batch.images, 1.0))]
     if batch.alpha is not None:
@@ -154,7 +154,7 @@ class Preprocessing:
 
 
 def preprocess(
-    batch: Batch, options: ModelOptions, patch_size: int, checks_values: bool
+    batch: Batch, options: ModelOptions, patch_size: int
 ) -> tuple[Batch, Preprocessing, list[Finding]]:
     """Preprocess a batch.
 
@@ -162,7 +162,6 @@ def preprocess(
         batch: in the cameras' world.
         options: options of the preprocessing.
         patch_size: patch size of the encoder in pixels.
-        checks_values: also check every value.
 
     Returns:
         The batch, its preprocessing, and findings about its values, to be read later.
@@ -170,7 +169,7 @@ def preprocess(
     Raises:
         InputError: a shape or a dtype is wrong.
     """
-    findings = findings_of(batch, options.side_multiple(patch_size), checks_values)
+    findings = findings_of(batch, options.side_multiple(patch_size))
     dtype = batch.cameras.extrinsics.dtype
     batch = with_matte(batch, options.matte)
     frame = Frame.of(batch) if options.frame == "subject" else None

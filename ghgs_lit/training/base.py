@@ -143,8 +143,10 @@ class BudgetedModule(L.LightningModule):
         Raises:
             InputError: the step is not finite, and the guard does not skip it."""
         self.optimization.drop_frozen_gradients(self, self.used_budget)
-        norm = self.optimization.clip_gradients(self)
-        if self.guard.check(self, norm, self._scaler):
+        gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
+        norm = nn.utils.get_total_norm(gradients, foreach=True)
+        if self.guard.check(self, norm, self._scaler):  # clipping would spread a value that is not finite
+            nn.utils.clip_grads_with_norm_(self.parameters(), self.optimization.clip, norm, foreach=True)
             self.log("train/gradient_norm", norm)
 
     @property

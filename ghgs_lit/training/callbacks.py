@@ -10,9 +10,6 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-from rich.table import Column
 
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
@@ -31,34 +28,23 @@ class ProgressOptions(Options):
 
 
 class RunProgress(Callback):
-    """Progress of the run: a bar on a terminal, otherwise one line a minute.
-    The lines are written to ``<run>/train.log`` in both cases."""
+    """Progress of the run: one line a minute, also in ``<run>/train.log``."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Open the log and start the bar."""
-        has_bar = Console().is_terminal
+        """Begin with a line after the first step."""
         self._log = Path(trainer.default_root_dir) / "train.log"
         self._next = time.monotonic()  # of the next line
-        text = TextColumn("{task.description}", table_column=Column())  # wraps on narrow terminals
-        columns = (BarColumn(), TaskProgressColumn(), text)
-        self._bar = Progress(*columns, disable=not (has_bar and trainer.is_global_zero))
-        self._task = self._bar.add_task("training", total=1.0)
-        self._bar.start()
         self._first = None  # time, step and used budget at the end of the first step
         self._written = trainer.global_step
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        """Update the bar, and write a line if one is due."""
+        """Write a line if one is due."""
         step = trainer.global_step
         # Between two batches of an accumulated step nothing has changed.
-        is_due = trainer.is_global_zero and step > self._written and time.monotonic() >= self._next
-        if is_due or not self._bar.disable:  # reading a step's values is a synchronisation
-            text = self._text(trainer, pl_module.used_budget)
-            self._bar.update(self._task, completed=pl_module.used_budget, description=text)
-        if is_due:
+        if trainer.is_global_zero and step > self._written and time.monotonic() >= self._next:
+            text = self._text(trainer, pl_module.used_budget)  # reading values is a synchronisation
             line = f"{datetime.datetime.now():%H:%M:%S} {text}"
-            if self._bar.disable:
-                print(line, flush=True)
+            print(line, flush=True)
             with open(self._log, "a") as file:
                 file.write(line + "\n")
             self._next = time.monotonic() + EVERY
@@ -78,15 +64,6 @@ class RunProgress(Callback):
             remaining = seconds * (1 - used) / (used - self._first[2])
             parts.append(f"{datetime.timedelta(seconds=round(remaining))} left")
         return "  ".join(parts)
-
-    def on_train_end(self, *args: Any) -> None:
-        """Stop the bar."""
-        self._bar.stop()
-
-    def on_exception(self, *args: Any) -> None:
-        """Stop the bar, which restores the terminal."""
-        if hasattr(self, "_bar"):  # training has started
-            self._bar.stop()
 
 
 class TrainingCost(Callback):

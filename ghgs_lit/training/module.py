@@ -2,15 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ghgs_lit.config import build
-from ghgs_lit.errors import require
 from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.execution.step import CapturedStep, Outcome
 from ghgs_lit.geometry.unprojection import seen_surfaces
@@ -21,7 +18,6 @@ from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_er
 from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
-from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
 Choice = TypeVar("Choice")
 #: Metrics of validations, as the run's protocol defines them; LPIPS only where it is available.
@@ -102,34 +98,6 @@ class GHGSModule(BudgetedModule):
         #: Prepares batches for the model; None: the model is not a :class:`GHGS` and takes them directly.
         self.predictor = Predictor(model) if isinstance(model, GHGS) else None
         self.captured_step = self.predictor and CapturedStep(self.predictor, renderer, losses)
-
-    @classmethod
-    def load_from_checkpoint(
-        cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
-    ) -> "GHGSModule":
-        """Load a module from a checkpoint of ``ghgs train`` or of any Trainer.
-
-        Args:
-            map_location: device of the weights; None: the CPU.
-            **parts: ``renderer``, ``losses`` and ``optimization`` that replace the configured ones.
-                Their weights, if any, are loaded from the checkpoint.
-
-        Returns:
-            The module, in training mode.
-
-        Raises:
-            InputError: the checkpoint cannot be used, or a part is neither configured nor given."""
-        checkpoint = read_checkpoint(checkpoint_path)
-        config = checkpoint["config"]
-        for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():
-            if name not in parts:
-                place = f"{checkpoint_path}: config.{group}"
-                require(group in config, place, f"options of it, or {name}=...", "nothing")
-                parts[name] = build(config[group], group)
-            if state := model_state(checkpoint, f"{name}."):  # e.g. a loss with trained weights
-                load_strictly(parts[name], state, checkpoint_path)
-        model = Predictor.from_checkpoint(checkpoint_path, map_location or "cpu").model
-        return cls(model.train(), config=config, **parts)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         """Predict Gaussians for a batch with targets, and render them from its target cameras."""

@@ -1,11 +1,11 @@
-"""Optimization: AdamW or Muon, a piecewise linear schedule over the run's budget, gradient clipping."""
+"""Optimization: AdamW or Muon, a piecewise linear schedule over the run's budget."""
 
 from collections.abc import Iterator
 from typing import Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import nn
 
 from ghgs_lit.config.options import Amount, Index, Options, Positive, Share
 from ghgs_lit.errors import require
@@ -98,16 +98,6 @@ class Optimization(Options):
         for name, parameter in named_weights(module):
             if name.startswith(frozen):
                 parameter.grad = None
-
-    def clip_gradients(self, module: nn.Module) -> Tensor:
-        """Scale all gradients so that their joint norm is at most ``clip``, without a synchronisation.
-
-        Args:
-            module: see :meth:`optimizer`.
-
-        Returns:
-            The norm before clipping, a scalar on the module's device."""
-        return nn.utils.clip_grad_norm_(module.parameters(), self.clip, foreach=True)
 
     def factor(self, progress: float) -> float:
         """Learning rate as a fraction of ``lr``.

@@ -1,5 +1,6 @@
 """Start of training: from scratch, from the weights of another run, or from an interrupted run."""
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -135,15 +136,14 @@ def with_origin(run: "Train", model: nn.Module) -> "Train":
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """Summarise what was loaded, and write all lines to the file ``written``.
+    """Count what was loaded, and write all lines to the file ``written``.
 
     Args:
         lines: result of :func:`initialize`.
 
     Returns:
-        At most 22 lines of text, in which loaded tensors are only counted."""
+        One line of text."""
     written.write_text("\n".join(lines) + "\n")
-    others = [line for line in lines if not line.startswith("loaded")]
-    loaded = len(lines) - len(others)
-    shown = others if len(others) <= 20 else [*others[:20], f"... and {len(others) - 20} more"]
-    return "\n".join([f"init_from {path}: {loaded} tensors loaded (all lines: {written})", *shown])
+    counts = Counter(line.partition("  ")[0] for line in lines)
+    numbers = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    return f"init_from {path}: {numbers} (tensors: {written})"

@@ -1,5 +1,4 @@
-"""Import of published weights to a checkpoint (every tensor must be used or listed as ignored), and export
-of a checkpoint's tensors under their published names."""
+"""Import of published weights to a checkpoint: every tensor must be used or listed as ignored."""
 
 import hashlib
 import re
@@ -9,21 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, import_optional, require
-from ghgs_lit.files import write_atomically
-from ghgs_lit.weights.checkpoint import (
-    describe,
-    model_state,
-    read_checkpoint,
-    require_shape,
-    shape_of,
-    write_checkpoint,
-)
+from ghgs_lit.weights.checkpoint import describe, require_shape, shape_of, write_checkpoint
 from ghgs_lit.weights.reading import open_file
-from ghgs_lit.weights.switches import differences
 
 FILE = "model.safetensors"
 
@@ -235,61 +224,3 @@ def import_weights(
     if release is None:
         report.append("the encoder alone: the other stages start afresh in each training, from its seed")
     return report
-
-
-def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
-    """Write the tensors of a checkpoint, bit for bit, under their published names.
-
-    Args:
-        checkpoint: checkpoint of this package.
-        vggt: file for the encoder (safetensors or PyTorch, by its suffix); None: not written.
-        release: PyTorch file for all other stages; None: not written.
-
-    Returns:
-        A report with one line per file.
-
-    Raises:
-        InputError: both are None, or a tensor has no published name; nothing is written then.
-    """
-    require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
-    content = read_checkpoint(checkpoint, whole=True)
-    state = model_state(content)
-    encoder = {name: tensor for name, tensor in state.items() if name.startswith("encoder.")}
-    heads = {name: tensor for name, tensor in state.items() if name not in encoder}
-    files = []
-    for path, part, table, entry in (
-        (vggt, encoder, VGGT, None),
-        (release, heads, RELEASE, RELEASE_ENTRY),
-    ):
-        if path is not None:
-            require(bool(part), str(checkpoint), f"tensors for {path}", "the encoder alone")
-            named = {to_published(name, table): name for name in part}
-            if None in named:
-                differing = ", ".join(differences(content["config"]))
-                raise InputError(
-                    f"{checkpoint}: expected a model of the release's form for release=<file>; found one"
-                    f" without a published form, with {named[None]} (it differs in {differing})"
-                )
-            files.append((path, {published: part[name] for published, name in named.items()}, entry))
-    for file in files:
-        write_tensors(*file)
-    return [f"{path}: {len(tensors)} tensors" for path, tensors, _ in files]
-
-
-def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:
-    """Write tensors as safetensors or a PyTorch file, by the suffix of the path.
-
-    Args:
-        path: path of the file.
-        tensors: tensors by name.
-        entry: key to store them under in a PyTorch file, if any.
-
-    Raises:
-        InputError: ``entry`` is given for safetensors, which cannot be nested.
-    """
-    if Path(path).suffix == ".safetensors":
-        require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")
-        write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata={"format": "pt"}))
-    else:
-        content = tensors if entry is None else {entry: tensors}
-        write_atomically(path, lambda temporary: torch.save(content, temporary))

@@ -33,7 +33,7 @@ def test_every_field_has_a_meaning():
 
 
 #: Required keys.
-GIVEN = {"export": ["checkpoint=a.ckpt"], "import": ["out=b.ckpt"], "table": ["runs=c"]}
+GIVEN = {"export": ["checkpoint=a.ckpt", "inference=b.ckpt"], "import": ["out=b.ckpt"], "table": ["runs=c"]}
 
 
 @pytest.mark.parametrize("verb", verbs())

@@ -11,7 +11,6 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.plugins.precision import MixedPrecision
 from torch.utils.data import DataLoader
 
-from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.metrics.functional import psnr, ssim
@@ -20,9 +19,9 @@ from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import CheckpointOptions
 from ghgs_lit.training.trainer import TrainerOptions
 from ghgs_lit.types import DepthMaps, Targets
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 from tests.helpers.losses import losses_of
-from tests.helpers.models import config, load_model, make_model
+from tests.helpers.models import load_model, make_model
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import (
     CONFIG,
@@ -176,8 +175,7 @@ def test_random_numbers_of_a_step_are_those_of_seed_step_and_part(monkeypatch):
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
-    """The checkpoint of a custom Trainer is enough to rebuild the model, and the module together with the
-    parts that are not configured."""
+    """The checkpoint of a custom Trainer is enough to rebuild the model."""
     parts = {"losses": losses_of({"render_l1": 1.0}), "optimization": Optimization(lr=1e-3)}
     subject = GHGSModule(make_model(), flat_renderer, **parts)
     batch = make_batch(1, 3, 42, 42)
@@ -186,26 +184,9 @@ def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
     run = trainer(tmp_path, steps=1)
     run.fit(subject, batches)
     run.save_checkpoint(tmp_path / "mine.ckpt")
-    with pytest.raises(InputError, match=r"mine\.ckpt: config\.loss: expected options of it, or"):
-        GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt")
-    again = GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt", renderer=flat_renderer, **parts)
-    assert again.model.training
-    assert again.config == subject.config
-    for model in (again.model, load_model(tmp_path / "mine.ckpt")):
-        for name, value in subject.model.state_dict().items():
-            assert torch.equal(model.state_dict()[name], value), name
-
-
-def test_the_module_of_a_run_is_read_with_its_parts(tmp_path):
-    """Losses, optimizer and renderer are those of the run's configuration."""
-    names = ("renderer", "loss", "optimizer")
-    nodes = run_of("train", ["loss.weights.depth=0.25", "optimizer.lr=0.003"]).plain
-    whole = {**config(), **{name: nodes[name] for name in names}, "seed": 7}
-    write_checkpoint(tmp_path / "last.ckpt", make_model().state_dict(), whole)
-    module = GHGSModule.load_from_checkpoint(tmp_path / "last.ckpt")
-    assert module.losses.weights.depth == 0.25
-    assert module.optimization.lr == 0.003
-    assert module.config["seed"] == 7
+    model = load_model(tmp_path / "mine.ckpt")
+    for name, value in subject.model.state_dict().items():
+        assert torch.equal(model.state_dict()[name], value), name
 
 
 def test_validation_measures_clamped_renders(tmp_path):

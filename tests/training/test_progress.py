@@ -1,9 +1,6 @@
-"""Progress of a run: lines, or a bar on a terminal."""
+"""Progress of a run in lines."""
 
 import re
-
-import pytest
-from rich.console import ConsoleDimensions
 
 from ghgs_lit.training.callbacks import RunProgress
 from tests.helpers.training import loader, module, trainer
@@ -20,18 +17,6 @@ def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     assert re.fullmatch(r"\d\d:\d\d:\d\d step 1 of 12  loss/total \S+", lines[0])
     last = r"step 11 of 12  loss/total \S+  val/psnr \S+  \S+ steps/s  0:00:0\d left"
     assert re.search(last, lines[10])
-
-
-@pytest.mark.parametrize("width", [80, 160])
-def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
-    """A terminal shows the bar, wrapped if narrow, and train.log gets the lines."""
-    monkeypatch.setattr("rich.console.Console.is_terminal", True)
-    monkeypatch.setattr("ghgs_lit.training.callbacks.EVERY", 0.0)
-    monkeypatch.setattr("rich.console.Console.size", ConsoleDimensions(width, 25))
-    trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
-    shown = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"100% step 12 of 12 +loss/total .* \S+ steps/s +0:00:00 left", shown)
-    assert len((tmp_path / "train.log").read_text().splitlines()) == 12
 
 
 def test_the_lines_come_once_a_minute(tmp_path, monkeypatch):

@@ -44,8 +44,7 @@ def test_each_tensor_has_its_line(tmp_path):
     ]
     assert "(4,), expected (3,)" in lines[1]
     text = report(lines, path, tmp_path / "init_from.txt")
-    assert text.splitlines()[0].startswith(f"init_from {path}: 1 tensors loaded")
-    assert text.splitlines()[1:] == lines[1:]
+    assert text.startswith(f"init_from {path}: 1 loaded, 1 wrong shape, 1 missing, 1 ignored (")
     assert (tmp_path / "init_from.txt").read_text().splitlines() == lines
 
 
@@ -96,14 +95,6 @@ def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
     run = run_of("evaluate", [f"checkpoint={path}"])
     assert with_trained_data(run).plain["data"] == data
     assert with_trained_data(run.replace(data={"workers": 2})).plain["data"] == {**data, "workers": 2}
-
-
-def test_a_long_report_ends(tmp_path):
-    """A model with a thousand tensors must not flood the terminal; the file contains all lines."""
-    lines = [f"missing      layer.{n} (3,): left as initialised" for n in range(50)]
-    text = report(lines, "a.ckpt", tmp_path / "all.txt")
-    assert text.splitlines()[-1] == "... and 30 more"
-    assert len((tmp_path / "all.txt").read_text().splitlines()) == 50
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])

@@ -13,7 +13,6 @@ from ghgs_lit.weights.checkpoint import (
     read_checkpoint,
     write_inference,
 )
-from ghgs_lit.weights.published import export_weights
 from ghgs_lit.weights.reading import SHIPPED_FILE, open_file
 from tests.helpers.checkpoints import content
 from tests.helpers.models import config, load_model, make_model
@@ -31,7 +30,6 @@ READERS = {
     "predict and evaluate": lambda path: load_model(path),
     "init_from": lambda path: initialize(make_model(), path),
     "resume": lambda path: check_resume(path, held(make_model()), config()),
-    "export": lambda path: export_weights(path, None, path.with_name("release.pth")),
     "inference": lambda path: write_inference(path, path.with_name("b.ckpt"), "float16"),
 }
 

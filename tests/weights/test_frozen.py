@@ -12,7 +12,6 @@ from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint, write_inference
-from ghgs_lit.weights.published import export_weights
 from tests.helpers.models import config, load_model, make_model
 from tests.helpers.training import held
 
@@ -22,7 +21,6 @@ READERS = {
     "predict and evaluate": Predictor.from_checkpoint,
     "init_from": lambda path: initialize(make_model(FROZEN), path),
     "resume": lambda path: check_resume(path, held(make_model(FROZEN)), config(FROZEN)),
-    "export": lambda path: export_weights(path, path.with_name("vggt.pt"), None),
     "inference": lambda path: write_inference(path, path.with_name("half.ckpt"), "float16"),
 }
 

@@ -1,4 +1,4 @@
-"""Published weights are imported strictly, predict, and are exported unchanged; downloads are checked."""
+"""Published weights are imported strictly and predict; downloads are checked."""
 
 import hashlib
 import itertools
@@ -8,18 +8,17 @@ import warnings
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.training import start
 from ghgs_lit.weights import published
-from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_checkpoint
-from ghgs_lit.weights.published import RELEASE, VGGT, VGGT_IGNORED, export_weights, match_names, to_ours
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
+from ghgs_lit.weights.published import RELEASE, VGGT, VGGT_IGNORED, match_names, to_ours
 from ghgs_lit.weights.switches import differences
 from tests.cli.test_main import call
-from tests.helpers import models
 from tests.helpers.models import close, load_model, predict
 from tests.helpers.scenes import make_batch
 from tests.helpers.weights import (
@@ -59,7 +58,7 @@ def test_the_published_names_and_shapes_are_exactly_the_models(prefix):
 
 
 @pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
-def test_an_imported_model_is_the_published_one_and_is_exported_unchanged(tmp_path, suffix):
+def test_an_imported_model_is_the_published_one(tmp_path, suffix):
     """Detects tensors that are renamed wrongly, changed or lost."""
     (vggt, release), (agg, network) = write_published(tmp_path, suffix)
     out = tmp_path / "out.ckpt"
@@ -78,18 +77,13 @@ def test_an_imported_model_is_the_published_one_and_is_exported_unchanged(tmp_pa
     batch = make_batch(1, 3, 50, 64)  # padded to 56 x 70
     with torch.no_grad():
         close(predict(load_model(out), batch).gaussians, predict(expected, batch).gaussians, 0)
-    export_weights(out, tmp_path / f"back{suffix}", tmp_path / "back.pth")
-    read = load_file if suffix == ".safetensors" else torch.load
-    again = torch.load(tmp_path / "back.pth", weights_only=True)["network"]
-    used = {name: value for name, value in agg.items() if name.startswith("aggregator.")}
-    for found, wanted in ((read(tmp_path / f"back{suffix}"), used), (again, network)):
-        assert set(found) == set(wanted)
-        assert all(torch.equal(found[name], value) for name, value in wanted.items())
+    state = model_state(checkpoint)
+    assert all(torch.equal(state[name], value) for name, value in renamed.items() if name is not None)
 
 
 def test_without_the_release_the_file_holds_the_encoder_alone(monkeypatch, capsys, tmp_path, files):
     """Heads are initialised from the seed of each training; tables show the origin of the encoder's
-    weights; such a file cannot predict, and its encoder can be exported."""
+    weights; such a file cannot predict."""
     vggt, _, agg, _ = files
     monkeypatch.chdir(tmp_path)
     out, settings = "start.ckpt", config("compat=none", "encoder.trainable=last_1")
@@ -125,15 +119,12 @@ def test_without_the_release_the_file_holds_the_encoder_alone(monkeypatch, capsy
 
     for argv, message in (
         (["predict", "data=synthetic"], "a whole model; found the encoder alone (`ghgs train init_from="),
-        (["export", "release=back.pth"], "tensors for back.pth; found 'the encoder alone'"),
         (["export", "inference=small.ckpt"], "a whole model; found 'the encoder alone'"),
     ):
         code, _, err = call(monkeypatch, capsys, *argv, "checkpoint=start.ckpt")
         assert (code, err.count("\n")) == (1, 1)
         assert f"start.ckpt: expected {message}" in err
-    assert not list(tmp_path.glob("back*")) + list(tmp_path.glob("small*"))
-    export_weights("start.ckpt", "back.safetensors", None)
-    assert set(load_file("back.safetensors")) == {name for name in agg if name.startswith("aggregator.")}
+    assert not list(tmp_path.glob("small*"))
 
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
@@ -209,40 +200,14 @@ def test_files_in_the_wrong_place_are_refused(monkeypatch, tmp_path, files, vggt
         import_weights(config(), out, vggt, release)
 
 
-def test_models_without_a_published_form_are_not_exported(tmp_path, files):
-    """The message names the differences, nothing is written, and a directory is not a file."""
-    for name, settings in {
-        "guide": config("compat=none", "gaussian_head.guide=true"),
-        "hull": models.config("model=hull"),
-    }.items():
-        out = tmp_path / f"{name}.ckpt"
-        write_checkpoint(out, GHGS.from_config(settings).state_dict(), settings)
-        said = r"expected a model of the release's form .*gaussian_head\.guide=True for False"
-        with pytest.raises(InputError, match=said):
-            export_weights(out, tmp_path / "back.pt", tmp_path / "back.pth")
-    (tmp_path / "folder").mkdir()
-    for vggt, release, message in (
-        (None, None, "vggt=<file>"),
-        (None, tmp_path / "back.safetensors", "release: expected a PyTorch file"),
-        (tmp_path / "folder", None, r"folder: expected a file to write; found 'a directory'"),
-    ):
-        import_weights(config(), tmp_path / "out.ckpt", files[0], files[1])
-        with pytest.raises(InputError, match=message):
-            export_weights(tmp_path / "out.ckpt", vggt, release)
-    assert not list(tmp_path.glob("back*"))
-
-
-def test_the_verbs(monkeypatch, capsys, tmp_path, files):
-    """The commands pass their keys on, and print paths last."""
+def test_the_verb(monkeypatch, capsys, tmp_path, files):
+    """The command passes its keys on, and prints the path last."""
     monkeypatch.chdir(tmp_path)
     given = ["vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY]
     code, out, _ = call(monkeypatch, capsys, "import", *given)
     assert code == 0
     assert "differs from the release" not in out
     assert out.splitlines()[-1] == "wrote a/out.ckpt"
-    code, out, _ = call(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
-    assert code == 0
-    assert out.splitlines()[-2:] == [f"back.pth: {len(files[3])} tensors", "wrote back.pth"]
 
 
 @pytest.mark.parametrize(("skip", "tokens"), [("balanced", "window"), ("fast", "subject"), ("exact", None)])
