@@ -46,7 +46,7 @@ class CountingProbe(Watcher):
         self.counts: Counts = {}
         self._open: list[tuple[int, int, int]] = []
 
-    def begin(self, stage: str, inputs: Any = None) -> None:
+    def begin(self, stage: str) -> None:
         self._open.append(self._so_far())
 
     def end(self, stage: str, result: Any = None) -> None:

@@ -28,7 +28,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.execution import predictor, step
-from ghgs_lit.execution.capture import CaptureBackend, CudaGraphs
+from ghgs_lit.execution.capture import CudaGraphs
 from ghgs_lit.geometry import precision
 from ghgs_lit.types import Batch
 from tests.helpers.capture_backends import OperatorBackend
@@ -45,7 +45,7 @@ class Gpu:
     def __init__(self, device: torch.device, is_real: bool):
         self.device, self.is_real = device, is_real
 
-    def backend(self) -> CaptureBackend:
+    def backend(self) -> CudaGraphs | OperatorBackend:
         """Capture backend: CUDA graphs; in a rehearsal, a stand-in that repeats operators."""
         return CudaGraphs() if self.is_real else OperatorBackend(self.device.type)
 

@@ -1,30 +1,25 @@
 """``ghgs stress``: compare stages with float64 on adversarial inputs."""
 
-import itertools
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-import torch
 from rich.progress import track
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.reports import pivot, print_tables, publish
 from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.diagnostics.stress.families import FAMILIES
-from ghgs_lit.diagnostics.stress.measure import Row, measure
+from ghgs_lit.diagnostics.stress.measure import Row, Stage, measure
 from ghgs_lit.diagnostics.stress.whole import STAGES
 from ghgs_lit.errors import require_choice
 from ghgs_lit.runs.results import provenance
-from ghgs_lit.runtime.cores import allowed_cores
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Stress
 
-Task = tuple[str, str, int]  #: Stage, family and number of cases
+Task = tuple[Stage, str, int]  #: Stage, family and number of cases
 
 
 def run(verb: "Stress") -> None:
@@ -39,8 +34,8 @@ def run(verb: "Stress") -> None:
     """
     directory = output_dir()
     write_config(verb, directory)
-    tasks = tasks_of(verb.stages, verb.quick)
-    rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)
+    tasks = track(tasks_of(verb.stages, verb.quick), "stages and families", transient=True)
+    rows = [row for task in tasks for row in measure(*task)]
     cells = pd.DataFrame(rows)
     content = {"cases": int(cells.cases.sum()), "failures": int(cells.failures.sum()), "cells": rows}
     content["provenance"] = provenance(verb.plain, seed=0, verb="stress", choices=choices())
@@ -69,37 +64,12 @@ def tasks_of(stages: Sequence[str] | None = None, quick: bool = False) -> list[T
     tasks = []
     for name in STAGES if stages is None else stages:
         require_choice("stages", name, tuple(STAGES))
-        seeds = STAGES[name].seeds
+        stage = STAGES[name]
+        seeds = stage.seeds
         if quick:
             seeds = 1 if seeds < 25 else 3
-        tasks += [(name, family, seeds) for family in STAGES[name].families]
+        tasks += [(stage, family, seeds) for family in stage.families]
     return tasks
-
-
-def measure_task(task: Task) -> list[Row]:
-    """The cells of a task, one for each dtype."""
-    name, family, seeds = task
-    return measure(STAGES[name], family, seeds)
-
-
-def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
-    """Cells of all tasks, in their order.
-
-    Args:
-        tasks: what to run.
-        workers: number of processes; 0: this one.
-    """
-    shown = track(tasks, "stages and families", transient=True)
-    if workers == 0:
-        return list(itertools.chain.from_iterable(map(measure_task, shown)))
-    # Spawned: a forked child would inherit locks of threads that it does not have.
-    context = get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, initializer=torch.set_num_threads, initargs=(1,))
-    try:
-        results = zip(shown, pool.map(measure_task, tasks), strict=True)
-        return list(itertools.chain.from_iterable(rows for _, rows in results))
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def worst_errors(cells: pd.DataFrame) -> pd.DataFrame:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Measured, Training, Verb
 from ghgs_lit.config.nodes import PerScene, Texts, Timing
-from ghgs_lit.config.options import Count, PathText, Seed, Text, Workers, name_type
+from ghgs_lit.config.options import Count, PathText, Seed, Text, name_type
 
 
 class Train(Training):
@@ -104,8 +104,6 @@ class Stress(Verb):
     """Run some thousand cases within a minute."""
     stages: tuple[Text, ...] | None = None
     """Names of stages, as printed by a run; null: all."""
-    workers: Workers | None = None
-    """Number of processes; null: one per processor; 0: this process."""
 
 
 class Table(Verb):

@@ -2,13 +2,11 @@
 captured graph depends on besides its inputs."""
 
 import threading
-import traceback
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from weakref import WeakSet
 
 import torch
@@ -19,15 +17,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ghgs_lit.runtime.watching import Wrapped
 
 Result = TypeVar("Result")
-
-
-class CaptureBackend(Protocol):
-    """Captures calls on devices of type ``device``."""
-
-    device: str
-
-    def capture(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """Capture a call; returns its result and a function that recomputes it in place."""
 
 
 #: A process captures one graph at a time.
@@ -51,11 +40,13 @@ class CudaGraphs:
         self._graphs: WeakSet = WeakSet()
 
     def capture(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """See :class:`CaptureBackend`. The call is first made once on the capture stream, to allocate
-        workspaces.
+        """Capture a call; it is first made once on the capture stream, to allocate workspaces.
 
         Args:
             call: launches work on the current GPU only.
+
+        Returns:
+            The result of the call, and a function that recomputes it in place.
         """
         with _alone:
             before = torch.cuda.current_stream()
@@ -89,14 +80,9 @@ class CudaGraphs:
         self._graphs = WeakSet()
 
 
-_PACKAGE = Path(__file__).parents[1]
-#: Files whose lines are skipped when a failure is located.
-_OWN = ("graphs.py", Path(__file__).name)
-
-
 class NotCapturable(RuntimeError):
     """An operator cannot be captured, or a model has hooks or replaced methods, which a graph would not
-    call. The message gives the reason and the location."""
+    call. The message gives the reason."""
 
 
 class CaptureChecks(TorchDispatchMode):
@@ -123,7 +109,7 @@ class CaptureChecks(TorchDispatchMode):
         given = list(_tensors((args, tuple(kwargs.values()))))
         reason = _reason(function, given, args, kwargs)
         if reason is not None:
-            raise NotCapturable(f"{reason} by {function.name()} ({_line()})")
+            raise NotCapturable(f"{reason} by {function.name()}")
         for storage in map(Tensor.untyped_storage, given):
             if storage._cdata not in self._made:
                 self.kept[storage._cdata] = storage
@@ -166,13 +152,6 @@ def _reason(function: Any, given: list[Tensor], args: tuple, kwargs: dict) -> st
     return "the host's memory is copied" if copies else None
 
 
-def _line() -> str:
-    """Innermost line of this package on the stack, for messages."""
-    lines = [f for f in traceback.extract_stack() if Path(f.filename).is_relative_to(_PACKAGE)]
-    lines = [f for f in lines if Path(f.filename).name not in _OWN]
-    return f"{Path(lines[-1].filename).name}:{lines[-1].lineno}" if lines else "no line of the package"
-
-
 _SIMPLE = (str, int, float, bool, type(None))
 #: Attributes that every module has.
 _COMMON = frozenset(vars(nn.Module())) - {"training"}
@@ -184,16 +163,11 @@ class ModelState(NamedTuple):
 
     Attributes:
         weights: identity and address of all parameters and buffers.
-        settings: all other attributes, by stage.
+        settings: all other attributes.
     """
 
     weights: tuple
-    settings: tuple[tuple[str, tuple], ...]
-
-    @property
-    def encoder(self) -> tuple:
-        """Settings of the encoder."""
-        return dict(self.settings)["encoder"]
+    settings: tuple
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,12 +192,11 @@ def state_of(model: nn.Module) -> ModelState:
     if torch_module._has_any_global_hook():
         raise NotCapturable("hooks of all modules")
     weights: list[Hashable] = []
-    stages: dict[str, list[Hashable]] = {}
+    settings: list[Hashable] = []
     for name, part in model.named_modules():
         values = vars(part)
         if any(values[hooks] for hooks in _HOOKS):
             raise NotCapturable(f"a hook of {name or 'the model'}")
-        settings = stages.setdefault(name.partition(".")[0], [])
         settings.append(Same(part))
         for attribute, value in values.items():
             if attribute in _COMMON:
@@ -234,7 +207,7 @@ def state_of(model: nn.Module) -> ModelState:
         for tensor in (*part._parameters.values(), *part._buffers.values()):
             if tensor is not None:
                 weights.append((id(tensor), tensor.data_ptr()))
-    return ModelState(tuple(weights), tuple((name, tuple(values)) for name, values in stages.items()))
+    return ModelState(tuple(weights), tuple(settings))
 
 
 def _key(value: Any, is_whole: bool = True) -> Hashable:

@@ -17,7 +17,7 @@ from weakref import WeakSet
 import torch
 from torch import Tensor
 
-from ghgs_lit.execution.capture import CaptureBackend, CaptureChecks, CudaGraphs, ModelState
+from ghgs_lit.execution.capture import CaptureChecks, CudaGraphs, ModelState
 from ghgs_lit.geometry.precision import rounding_state
 from ghgs_lit.rendering.capacity import Rooms, defer_checks
 
@@ -47,16 +47,15 @@ _caches: WeakSet = WeakSet()
 
 class GraphCache:
     """Calls functions of tensors, and replays them as CUDA graphs after the first call of a shape bucket,
-    which is eager: it fills caches, and a bucket that occurs once is not worth a capture.
+    which is eager: it fills caches, and a bucket that occurs once is not worth a capture. Neither is one that
+    recurs only after more buckets than there may be graphs.
 
     Graphs hold memory. If a call runs out of memory, all graphs of the process are freed, the call is
     repeated, and graphs are captured again later.
 
     Args:
         limit: largest number of graphs, at least 1; the least recently used one is evicted.
-        backend: captures graphs; None: CUDA graphs.
-        recent: number of buckets whose eager calls are remembered; None: 64 per graph. A bucket that
-            recurs only after more buckets than there are graphs would be captured in vain.
+        backend: captures graphs, as :class:`~ghgs_lit.execution.capture.CudaGraphs`, the default.
 
     Attributes:
         counts: numbers of calls that were ``replayed``, ``captured`` (and replayed), ``eager``,
@@ -64,9 +63,8 @@ class GraphCache:
         reasons: reasons why calls were not captured, each once.
     """
 
-    def __init__(self, limit: int = 8, backend: CaptureBackend | None = None, recent: int | None = None):
+    def __init__(self, limit: int = 8, backend: Any = None):
         self.limit = limit
-        self.recent = recent or 64 * limit
         self.backend = backend or CudaGraphs()
         self.counts: Counter[str] = Counter()
         self.reasons: list[str] = []
@@ -77,7 +75,7 @@ class GraphCache:
 
     def __reduce__(self) -> tuple:
         """Copies start without graphs."""
-        return type(self), (self.limit, type(self.backend)(self.backend.device), self.recent)
+        return type(self), (self.limit, type(self.backend)(self.backend.device))
 
     def clear(self) -> None:
         """Free all graphs."""
@@ -127,8 +125,8 @@ class GraphCache:
             function: depends on ``inputs``, ``key`` and tensors with fixed addresses, and does not write
                 its inputs. The first call of a bucket is eager, and so are all calls if the capture
                 fails, which is logged once.
-            inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
-                hashable.
+            inputs: dataclasses, tuples, lists and dicts of tensors on the backend's device, and of
+                anything hashable.
             key: everything else that may change what ``function`` does.
 
         Returns:
@@ -136,22 +134,17 @@ class GraphCache:
         """
         tensors: list[Tensor] = []
         bucket = self._bucket(inputs, key, tensors)
-        devices = {tensor.device for tensor in tensors}
-        is_here = len(devices) == 1 and devices.pop().type == self.backend.device
-        if bucket is not None and is_here:
-            with self._lock:
-                graph = self._graphs.get(bucket)
-                if graph is not None:
-                    self._graphs.move_to_end(bucket)
-                    self.counts["replayed"] += 1
-                elif self._is_due(bucket):
-                    graph = self._capture(bucket, function, inputs, tensors)
-                else:
-                    self.counts["eager"] += 1
-                if graph is not None:
-                    return _replay(graph, tensors)
-        else:
-            self.counts["eager"] += 1
+        with self._lock:
+            graph = self._graphs.get(bucket)
+            if graph is not None:
+                self._graphs.move_to_end(bucket)
+                self.counts["replayed"] += 1
+            elif self._is_due(bucket):
+                graph = self._capture(bucket, function, inputs, tensors)
+            else:
+                self.counts["eager"] += 1
+            if graph is not None:
+                return _replay(graph, tensors)
         return retry_without_graphs(lambda: function(inputs))
 
     def _is_due(self, bucket: Hashable) -> bool:
@@ -161,7 +154,7 @@ class GraphCache:
         is_known = bucket in self._seen
         self._seen[bucket] = None
         self._seen.move_to_end(bucket)
-        if len(self._seen) > self.recent:
+        if len(self._seen) > self.limit:
             self._seen.popitem(last=False)
         return is_known
 
@@ -200,15 +193,9 @@ class GraphCache:
         self._refused.add(bucket)
         self.note(reason)
 
-    def _bucket(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
-        """Key of the graphs that are valid for a call; None if it is not hashable. Appends the tensors of
-        ``inputs`` to ``tensors``."""
-        bucket = (key, describe_inputs(inputs, tensors), _torch_state(self.backend.device))
-        try:
-            hash(bucket)
-        except TypeError:
-            return None
-        return bucket
+    def _bucket(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable:
+        """Key of the graphs that are valid for a call. Appends the tensors of ``inputs`` to ``tensors``."""
+        return key, describe_inputs(inputs, tensors), _torch_state(self.backend.device)
 
 
 def free_graphs() -> bool:
@@ -281,7 +268,7 @@ def _replace_tensors(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
     return replace(value) if isinstance(value, Tensor) else value
 
 
-def _capture_function(backend: CaptureBackend, function: Callable[[Any], Any], inputs: Any) -> _Graph:
+def _capture_function(backend: Any, function: Callable[[Any], Any], inputs: Any) -> _Graph:
     """Capture ``function(inputs)`` on copies of the inputs.
 
     Raises:

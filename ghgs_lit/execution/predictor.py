@@ -168,7 +168,7 @@ class Predictor:
             return self._enter(batch)
         # Fresh cameras: cached values would put the same batch into another bucket the next time.
         bare = replace(batch, cameras=replace(batch.cameras), targets=None, subjects=(), views=())
-        key = ("enter", self.options, state.encoder)
+        key = ("enter", self.options, state.settings)
         with torch.no_grad():
             inside, *others = self.graphs(self._enter, bare, key)
         # Targets and names are not preprocessed.

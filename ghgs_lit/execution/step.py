@@ -97,7 +97,7 @@ class CapturedStep:
         self.predictor = predictor
         self.renderer = renderer
         self.losses = losses
-        self.graphs = GraphCache(limit=32, recent=8)
+        self.graphs = GraphCache(limit=16)
         self.buckets: dict[tuple, Sizes] = {}
 
     def captures(self, batch: Batch) -> bool:

@@ -1,4 +1,4 @@
-"""Watchers of a model's stages: observe their start and end, inputs and results.
+"""Watchers of a model's stages: observe their start and end, and their results.
 
 The model contains no code for this: modules get forward hooks, other stages are wrapped while they are
 watched.
@@ -8,7 +8,6 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from operator import attrgetter
 from typing import Any
 
 import torch
@@ -16,31 +15,16 @@ from torch import nn
 
 #: Point in time: seconds on the CPU, an event on CUDA.
 Mark = float | torch.cuda.Event
-#: Positional and named arguments of a stage.
-Inputs = tuple[tuple, dict[str, Any]]
 
 
 class Watcher:
     """Base class with callbacks at the start and end of stages, including nested ones."""
 
-    def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs | None:
-        """Called when a stage begins.
-
-        Args:
-            stage: Name of the stage.
-            inputs: Positional and keyword arguments.
-
-        Returns:
-            Inputs that replace the original ones; None: keep them.
-        """
+    def begin(self, stage: str) -> None:
+        """Called with the name of a stage when it begins."""
 
     def end(self, stage: str, result: Any = None) -> None:
-        """Called when a stage ends.
-
-        Args:
-            stage: Name of the stage.
-            result: Return value of the stage.
-        """
+        """Called with the name and the result of a stage when it ends."""
 
 
 @contextmanager
@@ -56,11 +40,13 @@ def watch_stages(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) 
     with ExitStack() as stack:
         for name, path in stages.items():
             parent, _, attribute = path.rpartition(".")
-            owner = attrgetter(parent)(model) if parent else model
+            owner = model.get_submodule(parent)
             stage = getattr(owner, attribute, None)
             if isinstance(stage, nn.Module):
-                for hook in _hooks(stage, name, watcher):
-                    stack.callback(hook.remove)
+                begin = stage.register_forward_pre_hook(lambda *_, name=name: watcher.begin(name))
+                end = stage.register_forward_hook(lambda *given, name=name: watcher.end(name, given[-1]))
+                stack.callback(begin.remove)
+                stack.callback(end.remove)
             elif stage is not None:
                 setattr(owner, attribute, Wrapped(stage, name, watcher))
                 stack.callback(setattr, owner, attribute, stage)
@@ -75,13 +61,6 @@ def watch_block(stage: str, watcher: Watcher) -> Iterator[None]:
     watcher.end(stage)
 
 
-def _hooks(stage: nn.Module, name: str, watcher: Watcher) -> tuple:
-    return (
-        stage.register_forward_pre_hook(lambda _, *inputs: watcher.begin(name, inputs), with_kwargs=True),
-        stage.register_forward_hook(lambda _, __, result: watcher.end(name, result)),
-    )
-
-
 class Wrapped:
     """A watched stage that is not a module."""
 
@@ -91,28 +70,13 @@ class Wrapped:
         self._watcher = watcher
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        inputs = (arguments, options)
-        arguments, options = self._watcher.begin(self._name, inputs) or inputs
+        self._watcher.begin(self._name)
         result = self._stage(*arguments, **options)
         self._watcher.end(self._name, result)
         return result
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stage, name)
-
-
-def time_mark(device: torch.device) -> Mark:
-    """Current time on ``device``; on CUDA the time when all work submitted so far has finished."""
-    if device.type != "cuda":
-        return time.perf_counter()
-    event = torch.cuda.Event(enable_timing=True)
-    event.record(torch.cuda.current_stream(device))
-    return event
-
-
-def seconds_between(begin: Mark, end: Mark) -> float:
-    """Seconds between two marks of :func:`time_mark` on the same device; both must have been reached."""
-    return end - begin if isinstance(begin, float) else begin.elapsed_time(end) / 1e3
 
 
 class Stopwatch(Watcher):
@@ -123,17 +87,26 @@ class Stopwatch(Watcher):
         self._open: list[Mark] = []
         self._spans: list[tuple[str, Mark, Mark]] = []
 
-    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
-        self._open.append(time_mark(self.device))
+    def begin(self, stage: str) -> None:
+        self._open.append(self._now())
 
     def end(self, stage: str, result: Any = None) -> None:
-        self._spans.append((stage, self._open.pop(), time_mark(self.device)))
+        self._spans.append((stage, self._open.pop(), self._now()))
+
+    def _now(self) -> Mark:
+        """Current time; on CUDA the time when all work submitted so far has finished."""
+        if self.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
 
     def seconds(self) -> dict[str, float]:
         """Seconds of each stage, in the order in which they first ended; synchronizes with the device."""
-        if self.device.type == "cuda":
+        is_cuda = self.device.type == "cuda"
+        if is_cuda:
             torch.cuda.synchronize(self.device)
         total: dict[str, float] = defaultdict(float)
-        for stage, begin, stop in self._spans:
-            total[stage] += seconds_between(begin, stop)
+        for stage, begin, end in self._spans:
+            total[stage] += begin.elapsed_time(end) / 1e3 if is_cuda else end - begin
         return dict(total)

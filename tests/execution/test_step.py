@@ -44,7 +44,7 @@ def make_step(model, losses=LOSSES, backend=OperatorBackend, capture="auto"):
 def with_backend(captured, backend):
     """Set a stand-in for CUDA graphs."""
     captured.predictor.graphs = GraphCache(limit=16, backend=backend())
-    captured.graphs = GraphCache(limit=32, recent=8, backend=backend())
+    captured.graphs = GraphCache(limit=16, backend=backend())
     return captured
 
 
