@@ -4,17 +4,11 @@ The model contains no code for this: modules get forward hooks, other stages are
 watched.
 """
 
-import time
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-import torch
 from torch import nn
-
-#: Point in time: seconds on the CPU, an event on CUDA.
-Mark = float | torch.cuda.Event
 
 
 class Watcher:
@@ -77,36 +71,3 @@ class Wrapped:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stage, name)
-
-
-class Stopwatch(Watcher):
-    """Watcher that measures the total time of each stage on ``device``, with events on CUDA."""
-
-    def __init__(self, device: torch.device):
-        self.device = device
-        self._open: list[Mark] = []
-        self._spans: list[tuple[str, Mark, Mark]] = []
-
-    def begin(self, stage: str) -> None:
-        self._open.append(self._now())
-
-    def end(self, stage: str, result: Any = None) -> None:
-        self._spans.append((stage, self._open.pop(), self._now()))
-
-    def _now(self) -> Mark:
-        """Current time; on CUDA the time when all work submitted so far has finished."""
-        if self.device.type != "cuda":
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record(torch.cuda.current_stream(self.device))
-        return event
-
-    def seconds(self) -> dict[str, float]:
-        """Seconds of each stage, in the order in which they first ended; synchronizes with the device."""
-        is_cuda = self.device.type == "cuda"
-        if is_cuda:
-            torch.cuda.synchronize(self.device)
-        total: dict[str, float] = defaultdict(float)
-        for stage, begin, end in self._spans:
-            total[stage] += begin.elapsed_time(end) / 1e3 if is_cuda else end - begin
-        return dict(total)

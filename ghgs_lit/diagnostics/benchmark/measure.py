@@ -1,10 +1,12 @@
 """Measurement of cases: cost, differences from the reference, and seconds of each stage."""
 
 import math
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,9 +26,11 @@ from ghgs_lit.ops.attention import attend
 from ghgs_lit.ply import ply_bytes
 from ghgs_lit.runs.results import Row
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
-from ghgs_lit.runtime.watching import Stopwatch, Watcher, watch_block, watch_stages
+from ghgs_lit.runtime.watching import Watcher, watch_block, watch_stages
 from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering
 
+#: Point in time: seconds on the CPU, an event on CUDA.
+Mark = float | torch.cuda.Event
 ROUNDS = "rounds"
 RENDER = "render"
 TOTAL = "total"
@@ -37,12 +41,36 @@ PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
 NAMES = (*STAGES[:1], *PARTS, *STAGES[1:], ROUNDS, RENDER, OTHER, TOTAL)
 
 
-class SecondsProbe(Stopwatch):
-    """Times of the stages, and of all work outside of them."""
+class SecondsProbe(Watcher):
+    """Total times of the stages on ``device``, with events on CUDA, and of all work outside of them."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self._open: list[Mark] = []
+        self._spans: list[tuple[str, Mark, Mark]] = []
+
+    def begin(self, stage: str) -> None:
+        self._open.append(self._now())
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self._spans.append((stage, self._open.pop(), self._now()))
+
+    def _now(self) -> Mark:
+        """Current time; on CUDA the time when all work submitted so far has finished."""
+        if self.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
 
     def seconds(self) -> dict[str, float]:
-        """Seconds by name, in the order of :data:`NAMES`."""
-        known = super().seconds()
+        """Seconds by name, in the order of :data:`NAMES`; synchronizes with the device."""
+        is_cuda = self.device.type == "cuda"
+        if is_cuda:
+            torch.cuda.synchronize(self.device)
+        known: dict[str, float] = defaultdict(float)
+        for stage, begin, end in self._spans:
+            known[stage] += begin.elapsed_time(end) / 1e3 if is_cuda else end - begin
         known[OTHER] = known[TOTAL] - sum(known[name] for name in top_level(known))
         return {name: known[name] for name in NAMES if name in known}
 
