@@ -9,13 +9,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.config import registry
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.method.encoder.semantic import SemanticBranch, features_of
@@ -69,10 +69,7 @@ def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]
     parts = _vertex_parts(len(vertices))
     expected = "those of a body whose parts are known, as of a built-in person (data=synthetic)"
     require(parts is not None, "vertices of the body", expected, len(vertices))
-    # The tree serves one batch only: these options make it fast to build, not fastest to query.
-    tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)
-    nearest = tree.query(points.double().cpu().numpy())[1]
-    return torch.from_numpy(parts[nearest]).to(points.device)
+    return torch.from_numpy(parts[nearest(points, vertices).cpu().numpy()]).to(points.device)
 
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
