@@ -96,7 +96,7 @@ def test_what_changes_a_prediction_is_another_bucket():
     assert len(found.rounds) == 2
     model(scene(views=3))
     model(scene(0.3))
-    assert counts(model) == {"captured": 2, "eager": 6, "replayed": 2}  # work before the plan
+    assert counts(model) == {"captured": 3, "eager": 7}  # one of them work before the plan
 
 
 def test_what_is_watched_or_has_a_gradient_is_called():
