@@ -108,6 +108,6 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     assert read_ply("splat/gaussians.ply").is_finite.all()
     if group not in ("renderer", "loss"):
         monkeypatch.delenv(registry.VARIABLE)
-        registry._REGISTERED.clear()
+        del registry._REGISTERED[group, "mine"]
         with pytest.raises(InputError, match=rf"{group}\.kind: expected .*{registry.VARIABLE}"):
             load_model(checkpoint)
