@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from benchmarks.gpu_measure import Call
 from ghgs_lit.execution import Predictor
@@ -104,3 +104,38 @@ def judge_step(call: Call, name: str, step: Any) -> None:
 
     judge(call, name, step.captured_step.graphs, differentiate)
     step.host = batch
+
+
+@torch.no_grad()
+def judge_optimizer(call: Call, name: str, step: Any) -> None:
+    """Add a row for the changes of a captured optimizer step, with other gradients.
+
+    Args:
+        call: of the section.
+        name: of the row.
+        step: of :mod:`benchmarks.gpu_sections`, whose optimizer has captured its step.
+    """
+    optimizer, cache = step.optimizer, getattr(step.optimizer, "graphs", None)
+    if cache is None:
+        return
+    weights: list[nn.Parameter] = [weight for weight in step.model.parameters() if weight.requires_grad]
+    written = [*weights, *(value for state in optimizer.state.values() for value in state.values())]
+    before = [tensor.clone() for tensor in written]
+    moved = [weight for weight in weights if weight in optimizer.state]
+
+    def step_optimizer(may_replay: bool) -> list[Tensor]:
+        for number, weight in enumerate(moved):
+            weight.grad = weight.detach().roll(1).mul(0.5 + number % 3)
+        optimizer.graphs = cache if may_replay else None
+        optimizer.step()
+        changes = [
+            new - old
+            for new, old in zip(copy_to_cpu(weights), copy_to_cpu(before[: len(weights)]), strict=True)
+        ]
+        for tensor, value in zip(written, before, strict=True):
+            tensor.copy_(value)
+        return changes
+
+    judge(call, name, cache, step_optimizer)
+    optimizer.graphs = cache
+    optimizer.zero_grad()

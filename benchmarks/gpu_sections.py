@@ -12,7 +12,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.gpu_measure import Call, reason
-from benchmarks.gpu_replay import judge_prediction, judge_step
+from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.measure import TOTAL, SecondsProbe, top_level, watch_block, watch_model
 from ghgs_lit.diagnostics.machine import machine_facts
@@ -23,6 +23,7 @@ from ghgs_lit.geometry.precision import keep_rounded, precision_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.ops.dispatch import OPERATORS
+from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch, map_tensors
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
@@ -126,6 +127,9 @@ class _Step:
         self.captured_step.graphs = GraphCache(backend=call.gpu.backend())
         self.options = run.optimizer
         self.optimizer = self.options.optimizer(self.model)
+        hold_rates(self.optimizer)
+        if not call.gpu.is_real and self.options.matrix_scale is not None:  # as Muon does on CUDA
+            self.optimizer.graphs = GraphCache(limit=2, backend=call.gpu.backend())
 
     def data(self) -> None:
         self.batch = self.host.to(self.device, non_blocking=True)
@@ -192,6 +196,7 @@ def _measure_captured_step(call: Call, name: str, step: _Step) -> None:
     work = call.gpu.work(step.run_captured, 2)
     call.add(f"{name}, captured", ms=ms, reason="; ".join(cache.reasons), **work, **cache.counts)
     judge_step(call, name, step)
+    judge_optimizer(call, f"{name}, optimizer", step)
 
 
 def step(call: Call) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from benchmarks import gpu
 from benchmarks.gpu_measure import DRY, Call, Rows, rehearsal
-from benchmarks.gpu_replay import WRONG, judge_prediction, judge_step
+from benchmarks.gpu_replay import WRONG, judge_optimizer, judge_prediction, judge_step
 from benchmarks.gpu_sections import SECTIONS, _enable_capture, _Step
 from ghgs_lit.execution import Predictor
 from tests.helpers.capture_backends import OperatorBackend, SilentBackend
@@ -38,9 +38,10 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
     if section == "step":
         parts = ("data", "forward", "render", "loss", "backward", "optimize")
         each = [f"batch of 1: {part}" for part in parts]
-        assert names == ["batch of 1", *each, "batch of 1, captured", "batch of 1, replay beside eager"]
-        assert found[-1]["verdict"] == "as eager"
-        measured = found[:-1]
+        judged = [f"batch of 1, {part}replay beside eager" for part in ("", "optimizer, ")]
+        assert names == ["batch of 1", *each, "batch of 1, captured", *judged]
+        assert [row["verdict"] for row in found[-2:]] == ["as eager"] * 2
+        measured = found[:-2]
         assert all(row["ms"] > 0 and row["launches"] > 0 and len(row["longest"]) <= 40 for row in measured)
 
 
@@ -63,6 +64,7 @@ class Lossy(OperatorBackend):
 BACKENDS = {
     "prediction": [None, (SilentBackend,), (Lossy, "aten::addmm", 0)],
     "step": [None, (SilentBackend,), (Lossy, "aten::mm", -1)],
+    "optimizer": [None, (SilentBackend,), (Lossy, "aten::_foreach_lerp_.Scalar", 0)],
 }
 PLANTED = [(kind, backend) for kind, backends in BACKENDS.items() for backend in backends]
 
@@ -87,7 +89,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
             step = _Step(call, call.run(*call.shipped), call.batch(1, 28))
             for _ in range(4):
                 step.run_captured()
-            judge_step(call, kind, step)
+            (judge_step if kind == "step" else judge_optimizer)(call, kind, step)
     [row] = rows.read()
     assert row["verdict"] == ("as eager" if planted is None else WRONG)
     monkeypatch.setattr(sys, "argv", ["gpu.py", "--table", str(tmp_path)])

@@ -20,6 +20,7 @@ from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.training import Optimization
+from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch
 from tests.helpers.capture_backends import SilentBackend
 from tests.helpers.losses import losses_of
@@ -110,13 +111,18 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
         model = two_rounds(kind).to(DEVICE).train()
         captured = CapturedStep(Predictor(model), Renderer(), losses)
         captured.graphs, captured.predictor.graphs = (GraphCache(backend=SilentBackend()) for _ in range(2))
+        options = Optimization(lr=1e-3, matrix_scale=1.0)
+        optimizer = options.optimizer(model)
+        optimizer.graphs = GraphCache(backend=SilentBackend())
+        hold_rates(optimizer)
         for _ in range(4):
             depths = 2.0 * batch.masks
             there = dataclasses.replace(batch, depths=depths, body_vertices=bodies).to(DEVICE)
             log.clear()
             captured(there).total.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0, foreach=True)
-            model.zero_grad()
+            options.clip_gradients(model)
+            optimizer.step()
+            optimizer.zero_grad()
     found = (log.launches, log.waits.total())
     print(found)
     counted = range(2) if torch.__version__.startswith(_VERSION) else [1]

@@ -118,6 +118,7 @@ class GraphCache:
         function: Callable[[Any], Result],
         inputs: Any,
         key: Hashable = (),
+        written: Sequence[Tensor] = (),
     ) -> Result:
         """Return ``function(inputs)``, without a gradient.
 
@@ -128,6 +129,8 @@ class GraphCache:
             inputs: dataclasses, tuples, lists and dicts of tensors on the backend's device, and of
                 anything hashable.
             key: everything else that may change what ``function`` does.
+            written: previously allocated memory that ``function`` writes to; a capture leaves it
+                unchanged.
 
         Returns:
             The result, in memory that later calls do not overwrite.
@@ -140,11 +143,13 @@ class GraphCache:
                 self._graphs.move_to_end(bucket)
                 self.counts["replayed"] += 1
             elif self._is_due(bucket):
-                graph = self._capture(bucket, function, inputs, tensors)
+                graph = self._capture(bucket, function, inputs, tensors, written)
             else:
                 self.counts["eager"] += 1
             if graph is not None:
                 return _replay(graph, tensors)
+        if written:  # such a call cannot be repeated
+            return function(inputs)
         return retry_without_graphs(lambda: function(inputs))
 
     def _is_due(self, bucket: Hashable) -> bool:
@@ -164,6 +169,7 @@ class GraphCache:
         function: Callable,
         inputs: Any,
         tensors: list[Tensor],
+        written: Sequence[Tensor],
     ) -> "_Graph | None":
         """Capture a new graph; None if that fails. Arguments as for :meth:`__call__`."""
         graph = None
@@ -171,7 +177,7 @@ class GraphCache:
         try:
             # Streams and graphs belong to the current GPU.
             with torch.cuda.device_of(tensors[0]):
-                graph = _capture_function(self.backend, function, inputs)
+                graph = _capture_function(self.backend, function, inputs, written)
         except torch.OutOfMemoryError:
             is_full = True
         except Exception as error:  # drivers fail in many ways
@@ -268,8 +274,10 @@ def _replace_tensors(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
     return replace(value) if isinstance(value, Tensor) else value
 
 
-def _capture_function(backend: Any, function: Callable[[Any], Any], inputs: Any) -> _Graph:
-    """Capture ``function(inputs)`` on copies of the inputs.
+def _capture_function(
+    backend: Any, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]
+) -> _Graph:
+    """Capture ``function(inputs)`` on copies of the inputs, and restore ``written`` afterwards.
 
     Raises:
         NotCapturable: the function reads a value of the device or copies from the host.
@@ -292,10 +300,13 @@ def _capture_function(backend: Any, function: Callable[[Any], Any], inputs: Any)
         with checks[-1]:
             return function(fresh)
 
+    values = [tensor.clone() for tensor in written]
     try:
         result, replay = backend.capture(call_checked)
     finally:
         torch.clear_autocast_cache()  # casts from a failed capture were never computed
+        with torch.no_grad():
+            _copy_all(written, values)
     return _Graph(places, result, replay, list(checks[-1].kept.values()))
 
 

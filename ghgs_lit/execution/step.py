@@ -100,11 +100,11 @@ class CapturedStep:
         self.graphs = GraphCache(limit=16)
         self.buckets: dict[tuple, Sizes] = {}
 
-    def captures(self, batch: Batch) -> bool:
+    def captures(self, batch: Batch, is_scaled: bool = False) -> bool:
         """Whether to try to capture a training step.
 
         Requires a device with capture, ``model.capture=auto``, no renderer or term of the loss of a
-        plug-in, and no float16 autocast, in which gradients underflow without a scaled loss.
+        plug-in, and under float16 autocast a scaled loss (``is_scaled``).
         """
         device = batch.masks.device.type
         model = self.predictor.model
@@ -114,15 +114,16 @@ class CapturedStep:
         if not (known and is_on and model.training):
             return False
         is_half = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
-        return not is_half
+        return is_scaled or not is_half  # gradients would underflow
 
-    def __call__(self, batch: Batch) -> Outcome:
+    def __call__(self, batch: Batch, scale: Tensor | None = None) -> Outcome:
         """Run the forward pass of a training step, replayed from the third batch of a bucket on.
 
         Batches with tall subjects or without a bucket, and models with hooks, run eagerly.
 
         Args:
             batch: on the device of the training, with targets; :meth:`captures` holds.
+            scale: scalar factor of the loss (``16-mixed``); None: 1.
         """
         predictor = self.predictor
         with predictor.model.rounds.fix_count():
@@ -135,7 +136,7 @@ class CapturedStep:
             targets = dataclasses.replace(batch.targets, names=(), protocols=())
             bodies = batch.body_vertices if self.losses.weights.chamfer else None
             seen = dataclasses.replace(batch, targets=targets, body_vertices=bodies, subjects=(), views=())
-            return self._capture(prepared, seen)
+            return self._capture(prepared, seen, scale)
 
     def _prepare(self, batch: Batch) -> Prepared:
         """Preprocess and plan a batch, with sizes that rarely change."""
@@ -150,23 +151,23 @@ class CapturedStep:
             self.buckets[shape] = self.buckets[view] = prepared.plan.sizes
         return prepared
 
-    def _capture(self, prepared: Prepared, seen: Batch) -> Outcome:
+    def _capture(self, prepared: Prepared, seen: Batch, scale: Tensor | None) -> Outcome:
         """Compute the loss with gradients from a captured graph; ``seen`` is the original batch."""
         one_pass = _Pass(self.predictor, self.renderer, self.losses)
         weights = {name: weight for name, weight in one_pass.named_parameters() if weight.requires_grad}
 
         def compute_gradients(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple]:
+            *inputs, scale = inputs
             # Twins: gradients of the weights themselves would be accumulated on another stream.
             twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
             with torch.enable_grad():
-                total, values = functional_call(one_pass, twins, inputs)
-            with torch.autocast(total.device.type, enabled=False):
-                gradients = torch.autograd.grad(total, list(twins.values()), allow_unused=True)
+                total, values = functional_call(one_pass, twins, tuple(inputs))
+                gradients = _differentiate(total, list(twins.values()), scale)
             gradients = tuple(map(_match_layout, gradients, weights.values()))
             return total.detach(), {name: value.detach() for name, value in values.items()}, gradients
 
         self.graphs.of_weights(prepared.state)
-        inputs = (Scene.of(prepared.batch, prepared.plan), prepared.done, seen)
+        inputs = (Scene.of(prepared.batch, prepared.plan), prepared.done, seen, scale)
         key = (
             prepared.state.settings,
             self.predictor.precision,
@@ -192,6 +193,20 @@ class CapturedStep:
 def _plain(sizes: Sizes) -> tuple:
     *rows, window = (getattr(sizes, field.name) for field in dataclasses.fields(sizes))
     return *rows, tuple(map(tuple, window))
+
+
+def _differentiate(total: Tensor, weights: Sequence[Tensor], scale: Tensor | None) -> list[Tensor | None]:
+    """Gradients of a loss for each weight, None for unused ones; computed on ``scale * total`` and divided
+    by ``scale``, against underflow in float16."""
+    with torch.autocast(total.device.type, enabled=False):
+        if scale is None:
+            return list(torch.autograd.grad(total, weights, allow_unused=True))
+        gradients = list(torch.autograd.grad(total * scale, weights, allow_unused=True))
+        used = [number for number, gradient in enumerate(gradients) if gradient is not None]
+        unscaled = torch._foreach_mul([gradients[number] for number in used], 1 / scale)
+        for number, gradient in zip(used, unscaled, strict=True):
+            gradients[number] = gradient
+        return gradients
 
 
 def _match_layout(gradient: Tensor | None, weight: Tensor) -> Tensor | None:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.training.guard import Guard
-from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.training.guard import Guard, Step
+from ghgs_lit.training.optimization import Optimization, convert_rates_to_numbers, hold_rates
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
@@ -62,6 +62,7 @@ class BudgetedModule(L.LightningModule):
             rate = group["lr"] * option["lr"] / schedule.base_lrs[number]
             group.update(option, lr=rate, initial_lr=option["lr"])
             schedule.base_lrs[number] = option["lr"]
+        hold_rates(optimizer)
 
     def on_train_batch_start(self, *args: Any) -> None:
         """Correct Lightning's count of steps, which is one too high after a run resumes from the end of
@@ -111,7 +112,7 @@ class BudgetedModule(L.LightningModule):
             raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
         return min(max(shares), 1.0)
 
-    def log_step(self, batch: Batch, total: Tensor, terms: Mapping[str, Tensor], **numbers: float) -> Tensor:
+    def log_step(self, step: Step, total: Tensor, terms: Mapping[str, Tensor], **numbers: float) -> Tensor:
         """Log a training step without a synchronisation, and hand it to the guard.
 
         Args:
@@ -121,7 +122,7 @@ class BudgetedModule(L.LightningModule):
 
         Returns:
             The loss."""
-        self.guard.note(batch, total, terms)
+        self.guard.note(step, total)
         numbers |= {
             "learning_rate": self.optimizers().param_groups[0]["lr"],
             "budget": self.used_budget,
@@ -130,8 +131,9 @@ class BudgetedModule(L.LightningModule):
         values = {f"loss/{name}": value.detach() for name, value in terms.items()}
         for name, number in numbers.items():
             # Created on the model's device: copying a number there would be a synchronisation.
-            values[f"train/{name}"] = torch.full((), number, device=self.device)
-        size = len(batch.images)
+            is_there = isinstance(number, torch.Tensor)
+            values[f"train/{name}"] = number if is_there else torch.full((), number, device=self.device)
+        size = len(step.batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict(values, batch_size=size)
         return total
@@ -155,7 +157,9 @@ class BudgetedModule(L.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Build the optimizer of all weights, and its schedule over the used budget."""
-        optimizer = self.optimization.optimizer(self, self._scaler is None)
+        options = getattr(self.model, "options", None)
+        captures = getattr(options, "capture", "auto") == "auto"
+        optimizer = self.optimization.optimizer(self, self._scaler is None, captures)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 
@@ -187,3 +191,4 @@ class BudgetedModule(L.LightningModule):
         checkpoint["config"] = self.config
         checkpoint["skipped_steps"] = self.guard.skipped
         checkpoint["frozen"] = [name for name, p in self.named_parameters() if not p.requires_grad]
+        convert_rates_to_numbers(checkpoint)

@@ -16,6 +16,7 @@ from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan.presets import KeptTokens, keep_patches
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.training.base import BudgetedModule, image_mean
+from ghgs_lit.training.guard import Step
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
 
@@ -104,12 +105,23 @@ class GHGSModule(BudgetedModule):
         prediction = (self.predictor or self.model)(batch)
         return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
-    def _forward_losses(self, batch: Batch) -> Outcome:
-        """Run the forward pass of a step, with CUDA-graph capture if possible."""
-        if self.captured_step is not None and self.captured_step.captures(batch):
-            return self.captured_step(batch)
-        prediction, rendering = self(batch)
-        return Outcome(*self.losses(prediction, rendering, batch), len(prediction.gaussians))
+    def forward_losses(self, step: Step) -> Outcome:
+        """Run the forward pass of a step eagerly, with random numbers from its seed."""
+        torch.manual_seed(step.seed)
+        with token_budget(self.model, step.budget):
+            prediction, rendering = self(step.batch)
+        return Outcome(*self.losses(prediction, rendering, step.batch), len(prediction.gaussians))
+
+    def _run_captured(self, step: Step) -> Outcome | None:
+        """Run the forward pass of a step with CUDA-graph capture; None: it must run eagerly."""
+        captured = self.captured_step
+        scaler = self._scaler
+        if captured is None or not captured.captures(step.batch, scaler is not None):
+            return None
+        scale = None if scaler is None else scaler.scale(torch.ones((), device=self.device))
+        torch.manual_seed(step.seed)
+        with token_budget(self.model, step.budget):
+            return captured(step.batch, scale)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Run the forward pass of a step on a batch with targets and log its loss, without a
@@ -121,10 +133,9 @@ class GHGSModule(BudgetedModule):
         if self.token_budgets is not None:
             # Equal in all processes, so that none waits for another.
             budget = sample_budget(self.token_budgets, self.step_numbers(batch_idx))
-        torch.manual_seed(self.step_seed(batch_idx))
-        with token_budget(self.model, budget):
-            total, terms, gaussians = self._forward_losses(batch)
-        return self.log_step(batch, total, terms, gaussians=gaussians / len(batch.images))
+        step = Step(batch, self.step_seed(batch_idx), budget)
+        total, terms, gaussians = self._run_captured(step) or self.forward_losses(step)
+        return self.log_step(step, total, terms, gaussians=gaussians / len(batch.images))
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Predict, render and measure a batch with targets.

@@ -10,10 +10,13 @@ matrices of one shape are multiplied in one batch: 22 ms instead of 102 a step f
 weights that come with the package (one core)."""
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from ghgs_lit.execution.graphs import GraphCache
 
 #: Newton-Schulz iteration: an odd polynomial that moves singular values in (0, 1] close to 1 (Jordan
 #: et al.).
@@ -70,24 +73,40 @@ def _orthogonalize_stack(matrices: Tensor) -> Tensor:
     return matrices
 
 
+def _place(value: Any) -> Any:
+    """A tensor's storage, on which a captured graph depends; any other value unchanged."""
+    return value.untyped_storage()._cdata if isinstance(value, Tensor) else value
+
+
 class Muon(torch.optim.AdamW):
     """Optimizer with Muon for matrices (:func:`is_matrix`), and AdamW for all other parameters.
 
     Args:
-        matrix_lr: learning rate of matrices, whose steps are about as long as AdamW's at this rate.
+        matrix_lr: learning rate of matrices, whose steps are about as long as AdamW's at this rate. A
+            number, or, like AdamW's ``lr``, a scalar tensor on the parameters' device, so that a
+            captured step follows the schedule.
+        captures: whether steps on a GPU are captured as a CUDA graph.
         **options: options of AdamW; weight decay applies to both."""
 
-    def __init__(self, parameters: Iterable[nn.Parameter], matrix_lr: float, **options: Any):
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        matrix_lr: float | Tensor,
+        captures: bool = True,
+        **options: Any,
+    ):
         parameters = list(parameters)
         others = [p for p in parameters if not is_matrix(p)]
         matrices = [p for p in parameters if is_matrix(p)]
         groups = [{"params": others, "orthogonal": False}]
         groups.append({"params": matrices, "orthogonal": True, "lr": matrix_lr})
         super().__init__([group for group in groups if group["params"]], **options)
+        on_gpu = any(parameter.is_cuda for parameter in matrices)
+        self.graphs = GraphCache(limit=2) if captures and on_gpu else None
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
-        """Take a step, and remove the gradients of matrices.
+        """Take a step, and remove all gradients.
 
         Args:
             closure: recomputes the loss and the gradients before the step.
@@ -98,14 +117,30 @@ class Muon(torch.optim.AdamW):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        moved = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        gradients = [parameter.grad for parameter in moved]
+        if self.graphs is None:
+            self._move(moved, gradients)
+        else:
+            states = [value for p in moved for value in self.state.get(p, {}).values()]
+            numbers = [item for group in self.param_groups for item in group.items() if item[0] != "params"]
+            key = tuple((name, _place(value)) for name, value in numbers), tuple(map(_place, moved + states))
+            self.graphs(partial(self._move, moved), gradients, key, moved + states)
+        for parameter in moved:
+            parameter.grad = None
+        return loss
+
+    def _move(self, moved: Sequence[nn.Parameter], gradients: Sequence[Tensor]) -> None:
+        """Take a step with these gradients, one per parameter, such as the inputs of a captured graph."""
+        for parameter, gradient in zip(moved, gradients, strict=True):
+            parameter.grad = gradient
         for group in self.param_groups:
             matrices = [parameter for parameter in group["params"] if parameter.grad is not None]
             if group["orthogonal"] and matrices:
                 self._move_matrices(matrices, group["lr"], group["weight_decay"])
         super().step()
-        return loss
 
-    def _move_matrices(self, moved: Sequence[nn.Parameter], lr: float, weight_decay: float) -> None:
+    def _move_matrices(self, moved: Sequence[nn.Parameter], lr: float | Tensor, weight_decay: float) -> None:
         """Update matrices, and remove their gradients, so that AdamW skips them."""
         for parameter in moved:
             if not self.state[parameter]:  # AdamW requires ``step`` when it loads a state

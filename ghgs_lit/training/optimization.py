@@ -17,6 +17,8 @@ BelowOne = Annotated[float, Field(ge=0, lt=1)]
 EPS = 1e-8
 #: Initial learning rate as a fraction of the highest one.
 START_FACTOR = 0.04
+#: Devices on which learning rates stay numbers: on a CPU, PyTorch's AdamW rounds a tensor to float32.
+_BY_NUMBER = ("cpu", "mps")
 
 
 def named_weights(module: nn.Module) -> Iterator[tuple[str, nn.Parameter]]:
@@ -60,14 +62,18 @@ class Optimization(Options):
     """Maximum number of consecutive steps that are skipped because their loss or gradient is not finite;
     0: the run stops at the first."""
 
-    def optimizer(self, module: nn.Module, fused: bool = True) -> torch.optim.AdamW:
+    def optimizer(self, module: nn.Module, fused: bool = True, captures: bool = True) -> torch.optim.AdamW:
         """Build the optimizer of all parameters that require gradients.
+
+        On a GPU it counts steps on the device (``capturable``), so that a step can be captured as a CUDA
+        graph; :func:`hold_rates` turns its learning rates into tensors.
 
         Args:
             module: a model, or a LightningModule with everything that has weights, on the training
                 device.
             fused: use PyTorch's fused AdamW, the fastest. It unscales gradients (``16-mixed``) inside
                 its step, which is too late for clipping.
+            captures: whether Muon's steps on a GPU are captured as a CUDA graph.
 
         Returns:
             AdamW, or Muon if ``matrix_scale`` is set.
@@ -80,10 +86,11 @@ class Optimization(Options):
             require(known, f"optimizer.freeze_until.{prefix}", "the beginning of a parameter's name", prefix)
         parameters = [parameter for _, parameter in named if parameter.requires_grad]
         options = {name: getattr(self, name) for name in ("lr", "betas", "weight_decay")}
-        options |= {"eps": EPS, "fused": fused}
+        on_gpu = all(parameter.device.type not in _BY_NUMBER for parameter in parameters)
+        options |= {"eps": EPS, "fused": fused, "capturable": on_gpu}
         if self.matrix_scale is None:
             return torch.optim.AdamW(parameters, **options)
-        return Muon(parameters, self.matrix_scale * self.lr, **options)
+        return Muon(parameters, self.matrix_scale * self.lr, captures, **options)
 
     def drop_frozen_gradients(self, module: nn.Module, progress: float) -> None:
         """Remove the gradients of parameters that ``freeze_until`` freezes, so that the optimizer,
@@ -108,3 +115,25 @@ class Optimization(Options):
             return START_FACTOR + (1 - START_FACTOR) * progress / self.warmup
         fall = (progress - self.warmup) / (1 - self.warmup)
         return 1 + (self.end_factor - 1) * min(fall, 1.0)
+
+
+def hold_rates(optimizer: torch.optim.Optimizer) -> None:
+    """Turn learning rates into tensors on the GPU, where captured steps read what the schedule writes.
+
+    Args:
+        optimizer: see :meth:`Optimization.optimizer`; unchanged if it is not ``capturable``."""
+    for group in optimizer.param_groups:
+        if group["capturable"]:
+            group["lr"] = torch.full((), float(group["lr"]), device=group["params"][0].device)
+
+
+def convert_rates_to_numbers(checkpoint: dict) -> None:
+    """Replace learning rates that are tensors (:func:`hold_rates`) by numbers.
+
+    Args:
+        checkpoint: Lightning's, with the states of optimizers and schedules; changed in place."""
+    for state in checkpoint.get("optimizer_states", ()):
+        for group in state["param_groups"]:
+            group["lr"] = float(group["lr"])
+    for state in checkpoint.get("lr_schedulers", ()):
+        state["_last_lr"] = [float(rate) for rate in state["_last_lr"]]

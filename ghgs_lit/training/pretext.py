@@ -21,6 +21,7 @@ from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.method.encoder.semantic import SemanticBranch, features_of
 from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.training.base import BudgetedModule
+from ghgs_lit.training.guard import Step
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 
@@ -160,10 +161,15 @@ class PretextModule(BudgetedModule):
         super().__init__(model, optimization, config)
         self.part_accuracy = MeanMetric()
 
+    def forward_losses(self, step: Step) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the loss of a step, also by its name."""
+        loss = cross_entropy(*self.model(step.batch)[:2])
+        return loss, {"parts": loss}
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Compute, log and return the loss."""
-        loss = cross_entropy(*self.model(batch)[:2])
-        return self.log_step(batch, loss, {"parts": loss})
+        step = Step(batch, self.step_seed(batch_idx))
+        return self.log_step(step, *self.forward_losses(step))
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Measure the accuracy of nearest patches per person, and the loss."""

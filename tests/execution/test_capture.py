@@ -112,8 +112,8 @@ def test_graphs_are_made_as_pytorch_documents(graphs):
 @pytest.mark.parametrize("end_fails", [True, False])
 def test_a_capture_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails):
     """PyTorch's context does not restore the stream if it cannot end a capture. Casts made meanwhile were
-    not computed."""
-    log, calls = [], []
+    not computed, and written memory is restored."""
+    log, calls, weight = [], [], torch.ones(3)
     stand_in = Graphs(log, end_fails)
     stand_in.install(monkeypatch)
     cache = GraphCache(backend=CudaGraphs("cpu"))
@@ -122,17 +122,20 @@ def test_a_capture_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails
 
     def work(values):
         calls.append(stand_in.current.name)
+        weight.add_(values)
         if len(calls) == 3:
             raise RuntimeError("operation not permitted when stream is capturing")
-        return values * 2
+        return weight * 2
 
+    expected = weight.clone()
     for number in range(3):
         if number == 1:
             with pytest.warns(UserWarning, match="cannot end" if end_fails else "not permitted"):
-                found = cache(work, torch.ones(3))
+                found = cache(work, torch.ones(3), written=[weight])
         else:
-            found = cache(work, torch.ones(3))
-        assert torch.equal(found, torch.full((3,), 2.0))
+            found = cache(work, torch.ones(3), written=[weight])
+        expected += 1
+        assert torch.equal(found, 2 * expected)
         assert stand_in.current is stand_in.main
     assert calls == ["main", "side", "side", "main", "main"]
     assert cleared == [1, 2, 3]

@@ -271,17 +271,21 @@ def test_casts_of_weights_are_captured_with_what_reads_them():
 
 
 def test_where_memory_is_lacking_graphs_make_room():
-    """Graphs of all caches are freed; without any, the error is raised."""
+    """Graphs of all caches are freed; without any, or if a call has written, the error is raised."""
     holder, other = make_cache(), make_cache()
     for seed in range(2):
         holder(work, (numbers(seed), numbers(seed)))
-    failures = iter([True, False, True])
+    failures = iter([True, False, True, True])
 
     def large(values):
         if next(failures, False):
             raise torch.OutOfMemoryError("CUDA out of memory")
         return values + 1
 
+    with pytest.raises(torch.OutOfMemoryError):
+        make_cache()(large, numbers(0), written=[torch.ones(1)])
+    assert holder._graphs
+    failures = iter([True, False, True])
     with pytest.warns(UserWarning, match="too little memory"):
         assert torch.equal(other(large, numbers(0)), numbers(0) + 1)
     with pytest.raises(torch.OutOfMemoryError):  # no graph is left to free

@@ -9,7 +9,7 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.execution import Predictor
+from ghgs_lit.execution import Predictor, step
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.rendering import capacity
@@ -102,6 +102,31 @@ def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, los
     assert dict(captured.graphs.counts) == {"eager": 1, "captured": 1, "replayed": 1}
 
 
+def test_a_factor_of_the_loss_changes_no_gradient():
+    """For a constant or changing factor, gradients equal those of an eager step."""
+    model, batch = training("model=paper"), scene()
+    captured = make_step(model)
+    wanted = gradients_of(model, call_eagerly(model, batch)[0])
+    for exponent in (10, 16, 12):
+        scale = torch.full((), 2.0**exponent, device=DEVICE)
+        found = captured(batch, scale)
+        slope = gradients_of(model, found.total * scale)
+        for name in wanted:
+            wrong = (slope[name] / 2.0**exponent - wanted[name]).abs().max()
+            assert wrong <= 1e-5 * wanted[name].abs().max(), name
+    assert dict(captured.graphs.counts) == {"eager": 1, "captured": 1, "replayed": 1}
+
+
+def test_gradients_of_float16_do_not_underflow():
+    """2^-26 is 0 in float16, but its multiple is not."""
+    weight = torch.ones(4, requires_grad=True)
+    total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
+    assert step._differentiate(total, [weight], None)[0].abs().max() == 0
+    total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
+    (slope,) = step._differentiate(total, [weight], torch.tensor(2.0**10))
+    assert torch.equal(slope, torch.full((4,), 2.0**-26))
+
+
 def train(folder, capture):
     """Weights after four steps of two batches each, and the number of replays."""
     model = training("model=hull")
@@ -141,12 +166,20 @@ class LaunchCounter(L.Callback):
         self.counts.append((self.launch_log.launches, self.launch_log.waits.total()))
 
 
-def test_a_step_of_a_training_launches_few_kernels(there, tmp_path):
+def test_a_step_of_a_training_launches_few_kernels(there, tmp_path, monkeypatch):
     """In Lightning's loop, with synchronisations only for the plan, the capacity of renderings, and the
     guard."""
     model, counter = training("model=hull"), LaunchCounter(there)
-    module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2))
+    module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, matrix_scale=1.0))
     with_backend(module.captured_step, SilentBackend)
+    configured = module.configure_optimizers
+
+    def configure_with_graphs():
+        configuration = configured()
+        configuration["optimizer"].graphs = GraphCache(backend=SilentBackend())
+        return configuration
+
+    monkeypatch.setattr(module, "configure_optimizers", configure_with_graphs)
     batches = [scene(color=1 - number / 20).to("cpu") for number in range(5)]
     trainer = L.Trainer(
         strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()), max_steps=5,
@@ -214,7 +247,7 @@ def test_sizes_are_kept_while_they_are_enough():
 
 
 def test_what_cannot_be_captured_is_called(monkeypatch):
-    """Other devices, renderers and losses, float16, predictions, and
+    """Other devices, renderers and losses, float16 without a loss scale, predictions, and
     ``model.capture=off`` run eagerly."""
     model, batch = training("model=paper"), scene()
     captured = make_step(model)
@@ -226,6 +259,7 @@ def test_what_cannot_be_captured_is_called(monkeypatch):
         patch.setattr(torch, "is_autocast_enabled", lambda *_: True)
         patch.setattr(torch, "get_autocast_dtype", lambda *_: torch.float16)
         assert not captured.captures(batch)
+        assert captured.captures(batch, is_scaled=True)
     model.eval()
     assert not captured.captures(batch)
     assert not make_step(model.train(), capture="off").captures(batch)

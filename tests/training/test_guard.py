@@ -1,21 +1,25 @@
-"""Guard against steps that are not finite: it names the first value, saves the batch, and skips the step or
+"""Guard against steps that are not finite: it names the stage, saves the batch, and skips the step or
 stops the run, with the same decision in all processes."""
 
 import csv
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import lightning.pytorch as L
 import pytest
 import torch
 from lightning.pytorch.plugins.precision import MixedPrecision
+from torch import nn
 from torch.utils.data import DataLoader
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.guard import Step, first_fault
 from ghgs_lit.training.loggers import CsvLog
+from ghgs_lit.types import map_tensors
 from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
 from tests.helpers.processes import run_prepared
@@ -111,48 +115,78 @@ def test_with_a_scaled_loss_the_guard_leaves_overflows_to_the_scaler(tmp_path):
     assert depths.seen[2] == depths.seen[3]
 
 
-NAME = "gaussian_head.scale_header.2.weight"
+STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head")
+STAGES += ("renderer", "losses")
 
 
-def spoil_weight(subject):
-    subject.model.get_parameter(NAME).data.view(-1)[0] = torch.nan
+def real_module(folder, *overrides) -> GHGSModule:
+    losses = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 1.0})
+    renderer = Renderer(backend="cpu")
+    subject = GHGSModule(
+        make_model(*overrides), renderer, losses, Optimization(lr=0.01), config(*overrides)
+    ).train()
+    subject._trainer = trainer(folder, 1)
+    return subject
 
 
-def spoil_term(subject):
-    right = subject.losses
+@pytest.mark.parametrize("overrides", [(), ("model=paper", "skip=none"), ("skip=balanced",)])
+def test_an_ordinary_step_has_no_fault(tmp_path, overrides):
+    """Values that are infinite on purpose must not be reported, and gradients of the weights must stay
+    unchanged."""
+    subject = real_module(tmp_path, *overrides)
+    assert first_fault(subject, Step(training_batch(2), 1)) == ""
+    assert all(p.grad is None for p in subject.parameters())
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in subject.modules())
 
-    def forward(*given):
-        total, terms = right(*given)
-        return total * torch.inf, terms | {"depth": terms["depth"] * torch.inf}
 
-    subject.losses = forward
+def nan(value):
+    return map_tensors(value, lambda t: t * torch.nan if t.is_floating_point() else t)
 
 
-def spoil_gradient(subject):
-    subject.model.get_parameter(NAME).register_hook(lambda slope: slope * torch.nan)
+def infinite_slope(value):
+    return map_tensors(value, lambda t: t + (t - t.detach()).abs().sqrt() if t.requires_grad else t)
+
+
+#: Where the gradient is first not finite if a stage's result has an infinite slope.
+SLOPES = {
+    "encoder": "gradient of encoder",
+    "depth_head": "gradient of the result of encoder",
+    "unprojection": "gradient of the result of depth_head",
+    "recalibration": "gradient of the result of encoder",
+    "gaussian_head": "gradient of the result of recalibration",
+    "renderer": "gradient of the result of rounds",
+    "losses": "gradient of the result of renderer",
+}
 
 
 @pytest.mark.parametrize(
-    ("spoil", "place"),
-    [
-        (spoil_weight, f"weights {NAME}"),
-        (spoil_term, "term depth of the loss"),
-        (spoil_gradient, f"gradient of {NAME}"),
-    ],
+    ("stage", "change", "place"),
+    [(stage, nan, f"result of {stage}") for stage in STAGES]
+    + [(stage, infinite_slope, place) for stage, place in SLOPES.items()],
 )
-def test_the_first_value_that_is_not_finite_is_named_and_the_batch_saved_as_plain_data(
-    tmp_path, spoil, place
-):
-    losses = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 1.0})
-    model = make_model().train()
-    subject = GHGSModule(model, Renderer(backend="cpu"), losses, Optimization(lr=0.01), config())
-    spoil(subject)
+def test_the_place_where_values_are_first_not_finite_is_named(tmp_path, stage, change, place):
+    """Stages that such a value reaches later, or its gradient in the backward pass, are not named."""
+    subject = real_module(tmp_path)
+    owner = subject if stage in ("renderer", "losses") else subject.model
+    part = getattr(owner, stage)
+    if isinstance(part, nn.Module):
+        part.register_forward_hook(lambda part, inputs, result: change(result))
+    else:
+        setattr(owner, stage, lambda *inputs: change(part(*inputs)))
+    fault = first_fault(subject, Step(training_batch(), 1))
+    assert re.search(rf" in the {place}\b", fault)
+
+
+def test_a_weight_that_is_not_finite_is_named_and_the_batch_saved_as_plain_data(tmp_path):
+    """Stages whose inputs are already NaN are not named."""
+    subject, name = real_module(tmp_path), "gaussian_head.scale_header.2.weight"
+    subject.model.get_parameter(name).data.view(-1)[0] = torch.nan
     batches = DataLoader([training_batch(2)], batch_size=None, collate_fn=lambda b: b)
-    with pytest.raises(InputError, match=f"{place}; its batch is in"):
+    with pytest.raises(InputError, match=f"weights {name}; its batch is in"):
         trainer(tmp_path, 2).fit(subject, batches)
     content = torch.load(tmp_path / "faults" / "step_of_process_0.pt", weights_only=True)
     assert torch.equal(content["batch"]["images"], training_batch(2).images)
-    assert place in content["fault"]
+    assert name in content["fault"]
 
 
 class Written(Depths):

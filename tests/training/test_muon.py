@@ -1,9 +1,17 @@
 """Muon compared with PyTorch's, orthogonalisation, and AdamW for parameters that are not matrices."""
 
+from contextlib import nullcontext
+
+import pytest
 import torch
 from torch import nn
 
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.training import Optimization
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalize
+from ghgs_lit.training.optimization import convert_rates_to_numbers, hold_rates
+from tests.helpers.capture_backends import OperatorBackend
+from tests.helpers.pretend_device import DEVICE, pretend_device
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 
@@ -48,6 +56,30 @@ def test_neither_scale_nor_company_matters():
     scaled = [scale * matrix for scale, matrix in zip((1, 1e-30, 1e12, 1), several, strict=True)]
     zeros = torch.zeros(16, 20)
     torch.testing.assert_close(orthogonalize([*scaled, zeros]), [*alone, zeros], atol=1e-4, rtol=0)
+
+
+def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
+    """Learning rates stay the same tensors, which captured steps read, and checkpoints contain numbers."""
+    with pretend_device():
+        model = Small().to(DEVICE)
+        optimizer = Optimization(lr=0.01, matrix_scale=2.0).optimizer(model)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1 / (1 + step))
+        hold_rates(optimizer)
+        rates = [group["lr"] for group in optimizer.param_groups]
+        for seed in range(2):
+            for parameter in model.parameters():
+                parameter.grad = torch.full_like(parameter, seed)
+            optimizer.step()
+            schedule.step()
+        assert [group["lr"] for group in optimizer.param_groups] == rates
+        assert [rate.item() for rate in rates] == pytest.approx([0.01 / 3, 0.02 / 3])
+        files = {"optimizer_states": [optimizer.state_dict()], "lr_schedulers": [schedule.state_dict()]}
+        convert_rates_to_numbers(files)
+    assert [group["lr"] for group in files["optimizer_states"][0]["param_groups"]] == pytest.approx(
+        [0.01 / 3, 0.02 / 3]
+    )
+    assert files["lr_schedulers"][0]["_last_lr"] == pytest.approx([0.01 / 3, 0.02 / 3])
+    Optimization(lr=0.01, matrix_scale=2.0).optimizer(Small()).load_state_dict(files["optimizer_states"][0])
 
 
 def test_matrices_move_as_with_pytorchs_muon():
@@ -97,3 +129,36 @@ def test_parameters_without_gradient_stay():
     optimizer.step()
     moved = {name for name, p in model.named_parameters() if not torch.equal(p, before[name])}
     assert moved == {"square", "tall", "wide", "output", "token"}
+
+
+def take_steps(backend, capturable=True, steps=5):
+    """Take steps with a schedule on the pretend device; returns the weights, and counts of captures."""
+    model = Small().to(DEVICE)
+    model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
+    optimizer = Muon(model.parameters(), matrix_lr=0.02, capturable=capturable, **OPTIONS)
+    optimizer.graphs = backend and GraphCache(backend=backend)
+    hold_rates(optimizer)
+    for seed in range(steps):
+        for number, parameter in enumerate(model.parameters()):
+            value = torch.linspace(-1, 1, parameter.numel()).mul(7 * number + seed + 1).sin()
+            parameter.grad = value.view(parameter.shape).to(DEVICE)
+        optimizer.step()
+        for group in optimizer.param_groups if capturable else ():
+            group["lr"].mul_(0.9)
+        assert all(parameter.grad is None for parameter in model.parameters())
+    weights = [parameter.detach().cpu() for parameter in model.parameters()]
+    return weights, backend and dict(optimizer.graphs.counts)
+
+
+@pytest.mark.parametrize("capturable", [True, False])
+def test_steps_that_are_played_back_are_the_same(capturable):
+    """Replayed steps equal eager ones, also for channels-last weights; neither a capture nor a failed
+    attempt (AdamW that counts steps on the host) takes an extra step."""
+    with pretend_device():
+        wanted, _ = take_steps(None, capturable)
+        with nullcontext() if capturable else pytest.warns(UserWarning, match="not captured as a CUDA graph"):
+            found, counts = take_steps(OperatorBackend(), capturable)
+    for one, other in zip(wanted, found, strict=True):
+        assert torch.equal(one, other)
+    wanted = {"eager": 2, "captured": 1, "replayed": 2} if capturable else {"eager": 4, "refused": 1}
+    assert counts == wanted
