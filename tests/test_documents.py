@@ -100,6 +100,7 @@ def keys() -> frozenset[str]:
     # One option per group in each run, because composing takes a third of a second.
     runs = [(verb, []) for verb in VERBS]
     runs += [("train", [*filter(None, chosen)]) for chosen in zip_longest(*shipped)]
+    runs.append(("train", ["feature_cache.kind=disk"]))
     for verb, overrides in runs:
         collect(OmegaConf.to_container(compose(verb, overrides), resolve=False))
     return frozenset(found)

@@ -72,6 +72,8 @@ def _build_all(run: Run, folder: Path, reasons: _Reasons) -> None:
         reasons.attempt(start.initialize, model, run.init_from, run.init_strict, run.allow_random_encoder)
     if model is not None and data is not None:
         reasons.attempt(check_size, data, Predictor(model))
+        if run.feature_cache is not None and _is_rendered(data, ["train"]):
+            reasons.attempt(run.feature_cache.needs, model, data)
     if data is not None:
         _read_data(run, data, reasons)
 

@@ -204,6 +204,8 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     module = GHGSModule(model, renderer, losses, run.optimizer.build(), run.plain, run.token_budgets)
     check_size(data, module.predictor)
     step = prepare_start(run, module, directory)
+    if run.feature_cache is not None:  # None for verbs that do not train the whole model
+        run.feature_cache.attach(model, data)
     run = start.with_origin(run, model)
     module.config = {**module.config, **run.plain}
     silence_lightning()

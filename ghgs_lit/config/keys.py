@@ -9,7 +9,7 @@ from ghgs_lit.errors import require
 WITHOUT_INFLUENCE = (
     "hydra", "allow_random_encoder", "chosen", "dry_run", "overwrite", "resume", "logger", "callbacks",
     "data.cache_dir", "data.packed", "data.render_workers",
-    "data.workers",
+    "data.workers", "feature_cache.folder",
     "encoder.weights",  # repeats the origin of the weights of init_from, which is compared
     "evaluation.pictures", "trainer.log_every_n_steps",
 )  # fmt: skip

@@ -82,6 +82,10 @@ KINDS: dict[str, dict[str | None, str]] = {
     "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},
     "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
     "encoder": {"vggt": "ghgs_lit.method.encoder.VGGTOptions"},
+    "feature_cache": {
+        "none": "ghgs_lit.training.features.NoFeatureCache",
+        "disk": "ghgs_lit.training.features.DiskFeatureCache",
+    },
     "skip": {None: "ghgs_lit.method.plan.presets.SkipOptions"},
     "metrics": {"images": "ghgs_lit.metrics.MetricsOptions"},
     "renderer": {"splats": "ghgs_lit.rendering.Renderer"},

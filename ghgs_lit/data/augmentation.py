@@ -93,6 +93,12 @@ class Augmentation(Options):
         return self
 
     @property
+    def changes_photographs(self) -> bool:
+        """Whether the pixels of an input image can differ between steps."""
+        limits = (self.exposure, self.white_balance, self.gamma, self.cut, *self._of_masks)
+        return self.sizes is not None or (self.chance > 0 and any(limits))
+
+    @property
     def _of_masks(self) -> tuple[float, float, float]:
         return self.mask_offset, self.mask_ragged, self.mask_hole_chance
 

@@ -104,7 +104,7 @@ class CapturedStep:
         """Whether to try to capture a training step.
 
         Requires a device with capture, ``model.capture=auto``, no renderer or term of the loss of a
-        plug-in, and under float16 autocast a scaled loss (``is_scaled``).
+        plug-in, no tokens read from disk, and under float16 autocast a scaled loss (``is_scaled``).
         """
         device = batch.masks.device.type
         model = self.predictor.model
@@ -113,8 +113,10 @@ class CapturedStep:
         is_on = self.predictor.options.capture == "auto" and device == self.graphs.backend.device
         if not (known and is_on and model.training):
             return False
+        # A plug-in's encoder may not have the attribute.
+        reads_disk = getattr(model.encoder, "keeps_features", False)
         is_half = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
-        return is_scaled or not is_half  # gradients would underflow
+        return not reads_disk and (is_scaled or not is_half)  # gradients would underflow
 
     def __call__(self, batch: Batch, scale: Tensor | None = None) -> Outcome:
         """Run the forward pass of a training step, replayed from the third batch of a bucket on.

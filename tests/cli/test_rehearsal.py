@@ -65,6 +65,10 @@ def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
         ),
         (["encoder.trainable=none"], r"init_from: expected a checkpoint with the encoder's weights"),
         (["evaluation.split=bench"], r"evaluation\.split: expected one of train, val; found 'bench'"),
+        (
+            ["feature_cache.kind=disk"],
+            r"feature_cache: expected none where encoder\.vit is no dinov2 or learns",
+        ),
         (["data.size=43"], r"data\.size: expected sides divisible by the patch size 14"),
     ],
 )

@@ -69,6 +69,11 @@ CASES = {
     "weights and data": ("[tv]*", "table4", [r"vggt\.ckpt: expected", rf"thuman2: {FOLDER}"]),
     "import": ("", "table3 init_from=null", [r"init_from: expected a checkpoint with the encoder's weights"]),
     "LPIPS": ("", "table3 metrics.lpips=require", [r"LPIPS: expected the package torchvision"]),
+    "cache": (
+        "",
+        "table3 feature_cache.kind=disk feature_cache.folder=vggt.ckpt/cache",
+        [r"feature_cache\.folder: vggt\.ckpt/cache: expected a folder that can be written"],
+    ),
 }  # fmt: skip
 
 

@@ -260,6 +260,9 @@ def test_what_cannot_be_captured_is_called(monkeypatch):
         patch.setattr(torch, "get_autocast_dtype", lambda *_: torch.float16)
         assert not captured.captures(batch)
         assert captured.captures(batch, is_scaled=True)
+    model.encoder.aggregator.patch_embed.cache = object()  # tokens on disk
+    assert not captured.captures(batch)
+    model.encoder.aggregator.patch_embed.cache = None
     model.eval()
     assert not captured.captures(batch)
     assert not make_step(model.train(), capture="off").captures(batch)

@@ -241,6 +241,11 @@ class VGGTEncoder(nn.Module):
         for blocks in (self.aggregator.frame_blocks, self.aggregator.global_blocks):
             blocks[depth - count :].requires_grad_(True)
 
+    @property
+    def keeps_features(self) -> bool:
+        """Whether tokens are read from disk in training, which rules out CUDA-graph capture."""
+        return getattr(self.aggregator.patch_embed, "cache", None) is not None
+
     def forward(
         self,
         images: Float[Tensor, "b v c H W"],

@@ -2,6 +2,7 @@
 registers, whose tokens are the semantic features F of the paper."""
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -111,6 +112,8 @@ class VisionTransformer(nn.Module):
         self.patch_size = patch_size
         self.special = 1 + REGISTERS
         self.checkpointing = checkpointing
+        #: ``cache(dense, images)`` returns tokens of cached images; None: all are computed.
+        self.cache: Callable[..., Tensor] | None = None
         self.patch_embed = PatchEmbed(in_channels, width, patch_size)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + (image_size // patch_size) ** 2, width))
@@ -162,4 +165,12 @@ class VisionTransformer(nn.Module):
         return self.norm(x)
 
     def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
+        if self.cache is not None and self.training and kept.is_whole:
+            return self.cache(self.dense, images).flatten(0, 1)
         return kept.take(self.tokens(images, kept), self.special)
+
+    def dense(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n p c"]:
+        """Tokens of all patches of images, row by row."""
+        grid = (len(images), 1, *(side // self.patch_size for side in images.shape[2:]))
+        whole = KeptPatches.whole(grid, images.device)
+        return whole.take(self.tokens(images, whole), self.special).unflatten(0, (len(images), -1))
