@@ -1,17 +1,19 @@
 r"""All measurements of the first minutes on a GPU, as one prepared script for rented machines.
 
-    python benchmarks/gpu.py --dry                       # rehearse on the pretend device of the tests
-    python benchmarks/gpu.py                             # all sections, within 420 s
-    python benchmarks/gpu.py --seconds 250 step kernels  # some sections
+    python benchmarks/gpu.py --dry first second          # rehearse on the pretend device of the tests
+    python benchmarks/gpu.py first                       # 420 s: predictions, steps, kernels, loader
+    python benchmarks/gpu.py second                      # 240 s of training after at most 180 of preparation
+    python benchmarks/gpu.py --seconds 570 step prediction loader training    # within ten minutes
     python benchmarks/gpu.py --table runs/gpu            # print the tables of earlier runs
 
 Each section is a process with a time limit. Results are appended to ``<out>/<run>.jsonl``
 immediately; a section that fails or exceeds its limit is a row with its last lines, and the others
-continue. Sections run in their order on the command line, except that one that must wait for gsplat
-lets the next one pass; ``--seconds`` limits the run. Whether replayed results agree with eager calls,
-for other inputs than the captured ones, is a row with a verdict; wrong ones are printed last, and the
-exit status is 1. In the background, gsplat is compiled (its kernels for up to 9 channels, for this GPU)
-into ``--work``, where later calls reuse it.
+continue. Sections on the command line are one run, in their order, except that a section that must
+wait for people lets the next one pass; ``--seconds`` limits the run. Whether replayed results agree
+with eager calls, for other inputs than the captured ones, is a row with a verdict; wrong ones are
+printed last, and the exit status is 1. In the background, gsplat is compiled (its kernels for up to 9
+channels, for this GPU) and built-in people are rendered on all cores; they are paused during sections
+that a busy host would distort. Both are stored in ``--work``, where later calls reuse them.
 
 A compiled gsplat can be brought along. Build it on a machine with nvcc 13, and with the Python and
 PyTorch versions of the one with the GPU (three minutes on two cores for one architecture and kernels
@@ -19,7 +21,9 @@ for up to 9 channels):
 
     TORCH_CUDA_ARCH_LIST="9.0" pip install --no-build-isolation --no-deps --no-binary gsplat \
         --target gsplat_built gsplat==1.5.3
-    python benchmarks/gpu.py --gsplat gsplat_built
+    python benchmarks/gpu.py --gsplat gsplat_built first
+
+``second`` trains ``experiment=shipped`` with batches of eight; further overrides follow its name.
 """
 
 import argparse
@@ -47,7 +51,7 @@ from benchmarks.gpu_measure import DRY, Call, Gpu, Rows, Sizes, reason, rehearsa
 from benchmarks.gpu_replay import WRONG
 from benchmarks.gpu_sections import SECTIONS
 
-GSPLAT = "gsplat"
+GSPLAT, PEOPLE = "gsplat", "people"
 CHANNELS = 9  #: Largest number of channels of compiled kernels of gsplat
 LAST_LINES = 12  #: printed for a failed section
 
@@ -56,23 +60,32 @@ LAST_LINES = 12  #: printed for a failed section
 class Plan:
     """Conditions of a section.
 
-    ``seconds``: its limit. ``needs_gsplat``: its compilation must end first.
+    ``seconds``: its limit. ``needs``: background processes that must end first. ``quiet``: pause the
+    background meanwhile. ``patience``: seconds to wait for more people than the first ones.
     """
 
     seconds: int
-    needs_gsplat: bool = False
+    needs: tuple[str, ...] = ()
+    quiet: bool = False
+    patience: int = 0
 
 
-#: By importance; a section that must wait for gsplat lets the next one pass.
+#: By importance; a section that must wait for its needs lets the next one pass.
 PLANS = {
     "machine": Plan(40),
-    "step": Plan(100, True),
-    "prediction": Plan(100, True),
+    "step": Plan(100, (GSPLAT,), quiet=True),
+    "prediction": Plan(100, (GSPLAT,), quiet=True),
     "paper": Plan(75),
-    "frozen": Plan(60, True),
-    "kernels": Plan(75, True),
+    "frozen": Plan(60, (GSPLAT,)),
+    "loader": Plan(75, (GSPLAT, PEOPLE), quiet=True),
+    "kernels": Plan(75, (GSPLAT,)),
+    "training": Plan(240, (GSPLAT, PEOPLE), patience=150),
 }
-SECONDS = 420  #: of a run
+#: Runs: sections, and seconds in total.
+RUNS = {
+    "first": ([name for name in PLANS if name != "training"], 420),
+    "second": (["machine", "training"], 440),
+}
 
 
 class Background:
@@ -87,6 +100,11 @@ class Background:
     def is_running(self) -> bool:
         return self.process.poll() is None
 
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the process and its children, if it is running."""
+        if self.is_running():
+            os.killpg(self.process.pid, number)
+
     def wait(self, seconds: float) -> bool:
         """Wait up to ``seconds``; kill the process if it has not ended. Returns whether it ended in time."""
         try:
@@ -97,9 +115,8 @@ class Background:
         return True
 
     def stop(self) -> None:
-        """Kill the process and its children, if it is running."""
-        if self.is_running():
-            os.killpg(self.process.pid, signal.SIGKILL)
+        self.send(signal.SIGCONT)
+        self.send(signal.SIGKILL)
         self.process.wait()
 
     def last_lines(self) -> list[str]:
@@ -109,44 +126,61 @@ class Background:
 
 
 class Session:
-    """Sections of a run, one after another, while gsplat is compiled if one of them needs it."""
+    """Sections of a run, one after another, and the background processes."""
 
     def __init__(self, options: argparse.Namespace, rows: Rows, plans: dict[str, Plan], seconds: float):
         self.options, self.rows, self.plans = options, rows, plans
         self.scale = math.inf if options.dry else 1  # a rehearsal has no limits
         self.started, self.end = time.monotonic(), time.monotonic() + self.scale * seconds
         self.environment = environment_of(options)
-        is_needed = any(plan.needs_gsplat for plan in plans.values())
-        self.gsplat = Background(self.command(GSPLAT), self.environment) if is_needed else None
+        needs = {need for plan in plans.values() for need in plan.needs}
+        self.background = {need: Background(self.command(need), self.environment) for need in sorted(needs)}
 
     def command(self, section: str) -> list[str]:
         options = self.options
         if section == GSPLAT:
-            return [sys.executable, "-c", "pass" if options.dry else BUILD]
+            return [sys.executable, "-c", "pass" if options.dry else BUILD, str(options.work)]
         own = ["--section", section, "--out", str(self.rows.file), "--work", str(options.work)]
-        return [sys.executable, __file__, *own, *["--dry"] * options.dry]
+        dry = ["--dry"] if options.dry else []
+        nice = ["nice", "-n", "19"] if section == PEOPLE else []
+        return [*nice, sys.executable, __file__, *own, *dry, *options.overrides]
 
     def run(self) -> None:
         waiting = dict(self.plans)
         try:
             while waiting and time.monotonic() < self.end:
-                is_compiling = self.gsplat is not None and self.gsplat.is_running()
-                ready = [name for name, plan in waiting.items() if not (plan.needs_gsplat and is_compiling)]
+                ready = [name for name, plan in waiting.items() if self.is_ready(plan)]
                 if not ready:
                     time.sleep(0.2)
                     continue
-                self.measure(ready[0], waiting.pop(ready[0]))
+                plan = waiting.pop(ready[0])
+                self.measure(ready[0], plan)
             for name in waiting:
                 self.note(name, "no time was left", 0.0, [])
         finally:
-            if self.gsplat is not None:
-                self.gsplat.stop()
+            for process in self.background.values():
+                process.stop()
+
+    def is_ready(self, plan: Plan) -> bool:
+        """Whether the needs of a section are met, or never will be."""
+        if GSPLAT in plan.needs and self.background[GSPLAT].is_running():
+            return False
+        if PEOPLE not in plan.needs or not self.background[PEOPLE].is_running():
+            return True
+        is_first_there = any(row["section"] == PEOPLE and "numbers" in row for row in self.rows.read())
+        return is_first_there and time.monotonic() - self.started >= plan.patience
 
     def measure(self, name: str, plan: Plan) -> None:
         """Run a section and add a row with its status."""
-        if plan.needs_gsplat and self.gsplat.process.returncode:
-            self.note(name, f"{GSPLAT} failed", 0.0, self.gsplat.last_lines())
-            return
+        for need in plan.needs:
+            process = self.background[need]
+            if need == PEOPLE and plan.patience:
+                process.stop()  # frees its cores
+            elif not process.is_running() and process.process.returncode:
+                self.note(name, f"{need} failed", 0.0, process.last_lines())
+                return
+        for process in self.background.values():
+            process.send(signal.SIGSTOP if plan.quiet else signal.SIGCONT)
         begun = time.monotonic()
         section = Background(self.command(name), self.environment)
         try:
@@ -155,6 +189,8 @@ class Session:
             section.stop()
         status = "done" if section.process.returncode == 0 else "failed" if in_time else "took too long"
         self.note(name, status, time.monotonic() - begun, [] if status == "done" else section.last_lines())
+        for process in self.background.values():
+            process.send(signal.SIGCONT)
 
     def note(self, section: str, status: str, seconds: float, last_lines: list[str]) -> None:
         self.rows.add(section=section, status=status, s=seconds, last_lines=last_lines)
@@ -166,7 +202,7 @@ BUILD = "from gsplat.cuda._backend import _C; assert _C is not None, 'gsplat fou
 
 
 def environment_of(options: argparse.Namespace) -> dict[str, str]:
-    """Environment variables of all processes: paths of gsplat and its build."""
+    """Environment variables of all processes: paths of gsplat, its build and the people."""
     root = str(Path(__file__).resolve().parents[1])
     paths = [root, *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     if options.gsplat is not None:
@@ -175,8 +211,8 @@ def environment_of(options: argparse.Namespace) -> dict[str, str]:
         paths.insert(
             0, str(copy_with_fewer_channels(Path(found.origin).parent, options.work / "gsplat_source"))
         )
-    defaults = {"TORCH_EXTENSIONS_DIR": str(options.work / "extensions"), "PYTHONUNBUFFERED": "1"}
-    defaults["MAX_JOBS"] = str(os.cpu_count())
+    defaults = {"TORCH_EXTENSIONS_DIR": str(options.work / "extensions"), "GHGS_CACHE": str(options.work)}
+    defaults |= {"MAX_JOBS": str(os.cpu_count()), "PYTHONUNBUFFERED": "1"}
     return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
@@ -201,7 +237,7 @@ def run_section(options: argparse.Namespace) -> None:
     real = nullcontext(Gpu(torch.device("cuda"), is_real=True))
     with rehearsal() if options.dry else real as gpu:
         sizes = DRY if options.dry else Sizes()
-        call = Call(gpu, Rows(options.out), options.section, sizes)
+        call = Call(gpu, Rows(options.out), options.section, sizes, options.work, options.overrides)
         try:
             SECTIONS[options.section](call)
         except Exception as error:
@@ -226,11 +262,13 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 def report(found: list[dict[str, Any]]) -> str:
     """Tables of all sections, and the longest kernels of each row that has them."""
-    lines, hidden = [], ("section", "status", "last_lines", "longest")
+    lines, hidden = [], ("section", "status", "last_lines", "longest", "numbers")
     for name, section in SECTIONS.items():
         own = [row for row in found if row["section"] == name]
         ends, rows = ([row for row in own if ("row" in row) == has] for has in (False, True))
-        title = f"{section.__doc__.strip()} ({', '.join(row['status'] for row in ends)})"
+        title = (
+            f"{section.__doc__.strip()} ({', '.join(row['status'] for row in ends) or 'in the background'})"
+        )
         if own:
             lines.append(f"\n## {title}\n")
         if rows:
@@ -247,18 +285,30 @@ def report(found: list[dict[str, Any]]) -> str:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("sections", nargs="*", default=list(PLANS), help=", ".join(PLANS))
+    parser.add_argument("names", nargs="*", help=f"{', '.join(RUNS)}, sections, overrides of the training")
     parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", "runs/gpu")))
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "ghgs_gpu")
     parser.add_argument("--gsplat", type=Path, help="folder of a compiled gsplat")
     parser.add_argument("--dry", action="store_true", help="rehearse without a GPU, with small sizes")
     parser.add_argument("--table", type=Path, metavar="FOLDER", help="print the tables of files, no more")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="limit of all sections together")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="limit of a run")
     parser.add_argument("--section", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if unknown := set(options.sections) - set(PLANS):
-        parser.error(f"expected {', '.join(PLANS)}; found {', '.join(sorted(unknown))}")
+    options.overrides = [name for name in options.names if "=" in name]
+    options.names = [name for name in options.names if "=" not in name]
+    unknown = set(options.names) - set(RUNS) - set(PLANS)
+    if unknown:
+        parser.error(f"expected {', '.join([*RUNS, *PLANS])}; found {', '.join(sorted(unknown))}")
     return options
+
+
+def runs_of(names: list[str]) -> dict[str, tuple[list[str], float]]:
+    """Sections and seconds of runs by name; sections on the command line are one run."""
+    runs = {name: RUNS[name] for name in names if name in RUNS}
+    sections = [name for name in names if name in PLANS]
+    if sections:
+        runs["_".join(sections)] = (sections, sum(PLANS[name].seconds for name in sections) + 180)
+    return runs
 
 
 def main() -> None:
@@ -274,11 +324,12 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended by a limit of time"))
     options.out.mkdir(parents=True, exist_ok=True)
     options.work.mkdir(parents=True, exist_ok=True)
-    file = options.out / f"{'_'.join(options.sections)}.jsonl"
-    file.unlink(missing_ok=True)
     try:
-        plans = {section: PLANS[section] for section in options.sections}
-        Session(options, Rows(file), plans, options.seconds).run()
+        for name, (sections, seconds) in runs_of(options.names or ["first"]).items():
+            file = options.out / f"{name}.jsonl"
+            file.unlink(missing_ok=True)
+            plans = {section: PLANS[section] for section in sections}
+            Session(options, Rows(file), plans, min(seconds, options.seconds)).run()
     finally:
         show(options.out)
 

@@ -13,7 +13,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -177,6 +177,12 @@ class Sizes:
     copied: int = 2**28  #: numbers of float32
     product: int = 8192  #: rows and columns
     vertices: int = 10475
+    workers: tuple[int, ...] = (4, 8, 15)
+    seconds: float = 8.0  #: per measurement of the loader
+    people: tuple[tuple[int, int, int], ...] = (
+        *((16, 8, 4), (48, 24, 16), (96, 48, 16), (144, 72, 16), (200, 100, 16)),
+    )  #: training people, active ones, validation people, rendered step by step
+    training: tuple[str, ...] = ("trainer.max_time=00:00:03:00", "trainer.val_check_interval=25")
 
 
 DRY = Sizes(
@@ -193,6 +199,10 @@ DRY = Sizes(
     copied=2**10,
     product=64,
     vertices=50,
+    workers=(0,),
+    seconds=0.1,
+    people=((2, 1, 1),),
+    training=("trainer=cpu", "trainer.max_steps=4", "trainer.val_check_interval=2", "views=v3"),
 )
 
 
@@ -221,10 +231,17 @@ class Call:
     rows: "Rows"
     section: str
     sizes: Sizes
+    work: Path
+    overrides: list[str] = field(default_factory=list)
 
     def add(self, row: str, **numbers: Any) -> None:
         """Append a row immediately."""
         self.rows.add(section=self.section, row=row, **numbers)
+
+    @property
+    def rendered(self) -> list[int]:
+        """Numbers of rendered people: in training, active ones, in validation."""
+        return [row["numbers"] for row in self.rows.read() if "numbers" in row][-1]
 
     def run(self, *overrides: str) -> Run:
         return run_of("train", list(overrides))

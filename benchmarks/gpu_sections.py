@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.gpu_data import loader, people, training
 from benchmarks.gpu_measure import Call, reason
 from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
@@ -301,5 +302,9 @@ def _measure_attention(call: Call) -> None:
 
 
 SECTIONS: dict[str, Callable[[Call], None]] = {
-    section.__name__: section for section in (machine, step, prediction, paper, frozen, kernels)
+    section.__name__: section
+    for section in (
+        *(machine, step, prediction, paper, frozen, kernels, loader),
+        *(people, training),
+    )
 }

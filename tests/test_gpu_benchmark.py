@@ -25,7 +25,7 @@ TINY = dataclasses.replace(DRY, side=28, batches=(1,), large_batches=(1,), large
 def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
     """Runs without a GPU, so that no GPU time is lost to mistakes."""
     with rehearsal() as device:
-        call = Call(device, Rows(tmp_path / "rows.jsonl"), section, TINY)
+        call = Call(device, Rows(tmp_path / "rows.jsonl"), section, TINY, tmp_path)
         SECTIONS[section](call)
     found = call.rows.read()
     names = [row["row"] for row in found]
@@ -77,7 +77,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
             kept, *options = planted
             monkeypatch.setattr(device, "backend", lambda: kept(device.device.type, *options))
         rows = Rows(tmp_path / "rows.jsonl")
-        call = Call(device, rows, "step", TINY)
+        call = Call(device, rows, "step", TINY, tmp_path)
         if kind == "prediction":
             with torch.no_grad():
                 predictor = _enable_capture(call, Predictor(make_model("model=hull").eval().to(DEVICE)))
@@ -97,13 +97,20 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
         gpu.main()
 
 
+def test_sections_that_are_named_are_one_run():
+    """So that people are rendered while all of them run."""
+    runs = gpu.runs_of(["step", "training", "second"])
+    assert list(runs) == ["second", "step_training"]
+    assert runs["step_training"] == (["step", "training"], 520)
+
+
 @pytest.fixture
 def session(tmp_path, monkeypatch):
     """Run sections whose commands are Python code; returns the rows of results."""
 
     def run(plans, codes):
         monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", codes[name]])
-        options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path)
+        options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
         rows = Rows(tmp_path / "first.jsonl")
         gpu.Session(options, rows, plans, 60).run()
         return rows.read()
@@ -122,8 +129,8 @@ def test_a_section_that_fails_or_hangs_stops_no_other(session, tmp_path, monkeyp
         "paper": "pass",
     }
     plans = {
-        "step": gpu.Plan(30, True),
-        "kernels": gpu.Plan(1, True),
+        "step": gpu.Plan(30, ("gsplat",)),
+        "kernels": gpu.Plan(1, ("gsplat",), quiet=True),
         "paper": gpu.Plan(30),
     }
     ends = {row["section"]: row["status"] for row in session(plans, codes) if "status" in row}
@@ -139,7 +146,7 @@ def test_a_section_that_fails_or_hangs_stops_no_other(session, tmp_path, monkeyp
 def test_a_section_whose_needs_failed_is_not_run(session):
     """A failed compilation of gsplat is reported once per section, with the compiler's last lines."""
     code = "import sys; sys.exit('nvcc: not found')"
-    [row] = session({"step": gpu.Plan(30, True)}, dict.fromkeys(("gsplat", "step"), code))
+    [row] = session({"step": gpu.Plan(30, ("gsplat",))}, dict.fromkeys(("gsplat", "step"), code))
     assert (row["status"], row["last_lines"]) == ("gsplat failed", ["nvcc: not found"])
 
 

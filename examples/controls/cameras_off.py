@@ -13,11 +13,11 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.camera_errors import add_camera_errors
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.evaluate import trained_method
 from ghgs_lit.config import run_of
 from ghgs_lit.config.registry import load_plugins
+from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.types import Batch
@@ -35,9 +35,10 @@ def measure_run(checkpoint: Path, directory: Path, pixels: float) -> None:
     run = inputs.with_chosen_targets(inputs.with_trained_data(run_of("evaluate", keys)))
     run = run.replace(**inputs.model_of(run.checkpoint, run))
     method, facts = trained_method(run, torch.device("cpu"))
+    error = Augmentation(calibration=pixels)
 
     def add_errors(batch: Batch) -> Batch:
-        return add_camera_errors(batch, pixels, [subject_rng(0, subject) for subject in batch.subjects])
+        return error.add_imperfections(batch, [subject_rng(0, subject) for subject in batch.subjects])
 
     methods = {"model": dataclasses.replace(method, cameras=add_errors)}
     data = inputs.build_data(run)
