@@ -23,7 +23,7 @@ from yaml import YAMLError
 
 from ghgs_lit.cli.help import print_help
 from ghgs_lit.config import VERSION_BASE, compose, conf_dir
-from ghgs_lit.config.compose import store_defaults, to_plain
+from ghgs_lit.config.compose import check_ablation, store_defaults, to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.config.options import did_you_mean
@@ -184,6 +184,7 @@ def work(cfg: DictConfig, name: str, argv: Sequence[str]) -> object:
     try:
         if is_single:  # a file may set hydra.mode
             check_directory(hydra_node.overrides.hydra, sweeps=False)
+        check_ablation(cfg, hydra_node)
         is_given = any(word.lstrip("+").startswith("overwrite=") for word in argv)
         fits = is_given or not cfg.get("overwrite")
         require(fits, "overwrite", "a value on the command line alone", "true in a file")

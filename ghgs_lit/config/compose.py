@@ -9,16 +9,18 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from ghgs_lit.config.defaults import fill, verb_values
-from ghgs_lit.config.keys import flatten, lookup
+from ghgs_lit.config.folder import VERSION_BASE, conf_dir
+from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.reading import VERSION_BASE, conf_dir, reading_as_ghgs
+from ghgs_lit.config.reading import reading_as_ghgs
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.config.run import Run
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 #: First line of saved configurations; a file without it belongs to another program.
 HEADER = "# The configuration of this run, by ghgs."
@@ -124,6 +126,28 @@ def to_plain(cfg: DictConfig) -> dict[str, Any]:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     config = OmegaConf.to_container(cfg, resolve=True)
     return {group: config[group] for group in KINDS if group in config} | config
+
+
+def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
+    """Check that each key set by the chosen ablation has its value, unless the command line sets it.
+
+    Args:
+        cfg: Composed configuration.
+        hydra_node: Node ``hydra`` of the application that composed it.
+
+    Raises:
+        InputError: A key has another value.
+    """
+    name = hydra_node.runtime.choices.get("ablation")
+    wanted = _ablation_values(name)
+    composed = OmegaConf.to_container(cfg)
+    # with interpolations as typed
+    overrides = OmegaConf.to_container(hydra_node.overrides.task)
+    given = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
+    for key, value in wanted.items():
+        present = lookup(composed, key)
+        holds = present == value or is_below(key, ["hydra", *given])
+        require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", present)
 
 
 def _ablation_values(name: str | None) -> dict[str, Any]:

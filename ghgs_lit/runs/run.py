@@ -70,7 +70,7 @@ class Marker(BaseModel):
     config_hash: str
     resume: str | None
     job: str | None
-    sessions: list[dict[str, Any]]
+    sessions: list[dict[str, Any]] = []
 
 
 def runs_in_order(sweep: Path) -> list[str]:

@@ -17,7 +17,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tabulate import tabulate
 
-from ghgs_lit.config.compose import chosen_options, saved_text, to_plain
+from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text, to_plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.registry import verb_class
 from ghgs_lit.config.run import Run
@@ -127,6 +127,7 @@ def _make_plan(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path)
     for overrides in grid:
         stop_if_interrupted()
         cfg = loader.load_sweep_config(config, list(overrides))
+        check_ablation(cfg, cfg.hydra)
         with open_dict(cfg):
             cfg.hydra.job.num = len(planned)
             subdirectory = str(cfg.hydra.sweep.subdir)

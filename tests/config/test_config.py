@@ -147,8 +147,12 @@ def test_combinations_that_are_one_configuration_are_counted(monkeypatch, capsys
     ("files", "message"),
     [
         (
+            {"ablation": "# @package _global_\noptimizer: {freeze_until: {}}\n"},
+            "optimizer.freeze_until: expected {}, as ablation/mine.yaml sets it; found {'gaussian_head': ",
+        ),
+        (
             {"ablation": "optimizer: {lr: 1}"},
-            "ablation: expected one of allow_random_encoder, ",
+            "optimizer.lr: expected 1, as ablation/mine.yaml sets it; found ",
         ),
         (
             {"experiment": "# @package _global_\ndefaults: [{override /ablation: neither}]\n"},
@@ -160,7 +164,7 @@ def test_combinations_that_are_one_configuration_are_counted(monkeypatch, capsys
 def test_a_key_of_an_ablation_that_does_not_hold_is_refused(
     monkeypatch, capsys, tmp_path, own, files, message, mode
 ):
-    """Keys without the header end up below ``ablation``."""
+    """An empty mapping is merged, and keys without the header end up below ``ablation``."""
     flags = own(**files)
     flags += ["-m"] if mode == "-m" else [f"hydra.run.dir={tmp_path / 'run'}"]
     chosen = "experiment=mine" if "experiment" in files else "ablation=mine"
