@@ -14,10 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from ghgs_lit.config.defaults import fill, verb_values
-from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.reading import reading_as_ghgs
+from ghgs_lit.config.reading import VERSION_BASE, conf_dir, reading_as_ghgs
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
