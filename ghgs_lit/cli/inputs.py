@@ -1,6 +1,7 @@
 """Build data, renderer, model of a checkpoint and device from a verb's configuration."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -115,7 +116,8 @@ def with_trained_data(run: Measured) -> Measured:
         The run with data.
 
     Raises:
-        InputError: There is no checkpoint, or it contains no training data.
+        InputError: There is no checkpoint, it contains no training data, or the folder of its data does
+            not exist.
     """
     if run.data is not None:
         return run
@@ -131,6 +133,10 @@ def with_trained_data(run: Measured) -> Measured:
         raise InputError(f"data: expected {expected}; found none")
     data = {key: value for key, value in trained["data"].items() if key not in OF_MACHINE}
     merged = OmegaConf.merge({"data": data}, {"data": run.plain.get("data") or {}})
+    root = merged.data.get("root")
+    if "root" in data and root == data["root"] and isinstance(root, str) and not Path(root).is_dir():
+        expected = f"data.root=<folder>, as the data of {checkpoint} is not where it was trained"
+        raise InputError(f"data.root: expected {expected}; found no such folder {root!r}")
     return run.replace(data=OmegaConf.to_container(fill(merged))["data"])
 
 

@@ -151,6 +151,19 @@ def test_data_that_moved_are_one_override(composed, checkpoint, verb):
         inputs.with_trained_data(composed("evaluate", "data.root=new"))
 
 
+@pytest.mark.parametrize("verb", ["evaluate", "predict"])
+def test_data_that_are_not_here_are_named_by_their_key(composed, checkpoint, monkeypatch, tmp_path, verb):
+    """Regression: ``old: expected the folder of the data set`` did not mention the origin of the path."""
+    monkeypatch.chdir(tmp_path)
+    expected = (
+        r"data\.root: expected data\.root=<folder>, .*a\.ckpt is not where .*; found no such folder 'old'"
+    )
+    with pytest.raises(InputError, match=expected):
+        inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}"))
+    (tmp_path / "old").mkdir()
+    assert inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}")).data.root == "old"
+
+
 def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
     """Regression: ``rounds.hidden=65536`` in a checkpoint allocated 150 GB before the comparison with its
     weights."""
