@@ -155,7 +155,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         def build():
             return Predictor(make_model("model=paper").to(device).eval())
 
-        methods = {name: baseline(name, REFERENCE, build, 1) for name in BASELINES}
+        methods = {name: baseline(name, REFERENCE, 1) for name in BASELINES}
         methods["model"] = ModelMethod(build(), REFERENCE)
         methods["refined"] = ModelMethod(build(), REFERENCE, Refinement(1, REFERENCE))
         refined = build()

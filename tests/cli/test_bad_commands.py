@@ -86,7 +86,7 @@ def test_a_bad_command_gets_its_exit_code_and_one_line(
         ("evaluate data=synthetic", errno.EROFS),
         ("predict checkpoint={ckpt} data=synthetic", errno.EACCES),
         ("import out=x.ckpt", errno.EDQUOT),
-        ("export checkpoint={ckpt} vggt=x.pt", errno.ENOSPC),
+        ("export checkpoint={ckpt} inference=x.pt", errno.ENOSPC),
         ("table runs={empty}", errno.EROFS),
     ],
 )
@@ -113,7 +113,7 @@ def test_weights_that_do_not_fit_the_disk_are_one_line_with_their_path(monkeypat
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, before[1]))
     try:
         path = tmp_path / "encoder.pt"
-        code, text = call(monkeypatch, capfd, tmp_path, f"export checkpoint={files['ckpt']} vggt={path}")
+        code, text = call(monkeypatch, capfd, tmp_path, f"export checkpoint={files['ckpt']} inference={path}")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert code == 1, text

@@ -1,3 +1,8 @@
 """Small tensors: more threads would only wait for one another."""
 
-from tests.rendering.conftest import _one_thread  # noqa: F401  # a fixture for all tests here
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _fresh(one_thread):
+    """Every test of this folder has one thread."""
