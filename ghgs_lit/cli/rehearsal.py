@@ -23,6 +23,9 @@ from ghgs_lit.runs.sweep import PlannedRun, print_plan
 from ghgs_lit.training import start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
+#: Nodes of a configuration that determine which files a run reads.
+_OF_DATA = ("data", "views", "targets", "evaluation", "augmentation", "loss")
+
 
 def rehearse(planned: Sequence[PlannedRun]) -> list[str]:
     """Check the prerequisites of runs, each configuration once; renders and writes nothing and takes no
@@ -39,8 +42,13 @@ def rehearse(planned: Sequence[PlannedRun]) -> list[str]:
         for item in planned:
             if item.directory.checkpoint is not None:
                 reasons.attempt(read_checkpoint, item.directory.checkpoint)
+        of_data = {}
         for run in runs.values():
-            _build_all(run, Path(folder), reasons)
+            data = _build_all(run, Path(folder), reasons)
+            if data is not None:
+                of_data[config_hash({name: run.plain.get(name) for name in _OF_DATA})] = run, data
+        for run, data in of_data.values():
+            _read_data(run, data, reasons)
     return _summarize(reasons)
 
 
@@ -56,8 +64,8 @@ class _Reasons(list[str]):
             return None
 
 
-def _build_all(run: Run, folder: Path, reasons: _Reasons) -> None:
-    """Build everything that a run uses; loggers write to ``folder``."""
+def _build_all(run: Run, folder: Path, reasons: _Reasons) -> PhotographsDataModule | None:
+    """Build everything that a run uses, and return its data; loggers write to ``folder``."""
     reasons.attempt(job.check_config, run)
     if run.resume not in (None, AUTO):
         reasons.attempt(read_checkpoint, run.resume)
@@ -74,8 +82,7 @@ def _build_all(run: Run, folder: Path, reasons: _Reasons) -> None:
         reasons.attempt(check_size, data, Predictor(model))
         if run.feature_cache is not None and _is_rendered(data, ["train"]):
             reasons.attempt(run.feature_cache.needs, model, data)
-    if data is not None:
-        _read_data(run, data, reasons)
+    return data
 
 
 def _read_data(run: Run, data: PhotographsDataModule, reasons: _Reasons) -> None:

@@ -57,7 +57,7 @@ class Marker(BaseModel):
     """Content of ``run.json``.
 
     Attributes:
-        id: ID of the run, which is kept when the run is moved; external loggers use it, too.
+        id: ID of the run, which is kept when the run is moved, for provenance.
         config_hash: Hash of the configuration.
         resume: Value of ``resume`` that the run began with.
         job: SLURM job that last worked on the run.

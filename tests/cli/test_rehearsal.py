@@ -93,6 +93,16 @@ def test_a_single_run_that_lacks_nothing_writes_nothing(monkeypatch, capsys, tmp
     assert not list(tmp_path.iterdir())
 
 
+def test_data_of_several_configurations_are_read_once(monkeypatch, rendered):
+    """Ablations share their data, whose files are looked up one by one."""
+    read = []
+    monkeypatch.setattr(rehearsal, "_read_data", lambda run, data, reasons: read.append(run.data.size))
+    variants = ("optimizer.lr=1", "optimizer.lr=2", "data.size=56")
+    runs = [run_of("train", [*SMALL, f"data.root={rendered}", variant]) for variant in variants]
+    rehearsal.rehearse([PlannedRun((), run, RunDirectory("none")) for run in runs])
+    assert read == [(42, 42), (56, 56)]
+
+
 def test_a_checkpoint_that_a_run_would_resume_from_is_read(tmp_path):
     """Regression: only the queued run reported a damaged one."""
     path = tmp_path / "run" / "checkpoints" / "last.ckpt"
