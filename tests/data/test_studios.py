@@ -288,13 +288,16 @@ def test_batches_have_the_protocols_cameras(zju_root):
     assert [len(names) for sample in samples for names in sample.targets.names] == [17]
 
 
-def test_a_camera_that_lacks_a_frame_is_left_out(humman_root, tmp_path):
+def test_a_camera_that_lacks_a_frame_is_left_out(humman_root, tmp_path, caplog):
     """Frames that a sequence lacks are skipped; a missing image removes one camera from its frame only."""
     shutil.copytree(humman_root / HUMMAN, tmp_path / HUMMAN)
     (tmp_path / HUMMAN / "kinect_color" / "kinect_004" / "000006.png").unlink()
     whole = tuple(range(10))
     cameras = {0: whole, 6: (0, 1, 2, 3, 5, 6, 7, 8, 9), 18: whole}
     assert of_humman(tmp_path).reader.subjects == {f"{HUMMAN}_{n:06d}": k for n, k in cameras.items()}
+    assert [record.getMessage().partition(": ")[2] for record in caplog.records if "lacks" in record.msg] == [
+        "frame 000006 lacks kinects [4], left out"
+    ]
 
 
 def test_named_sequences_are_for_testing_and_the_rest_for_training(humman_root, tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import PREAMBLE, read_sweep, to_csv, to_latex, to_markdown
-from ghgs_lit.evaluation.tables.runs import encoder_name
+from ghgs_lit.evaluation.tables.runs import encoder_name, find_views_of_columns
 from ghgs_lit.evaluation.tables.writers import markdown_to_latex
 from ghgs_lit.runs.results import config_hash, read_results, summarize, write_results
 from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, views
@@ -249,3 +249,18 @@ def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
     assert not list(tmp_path.glob(".*"))
     with pytest.raises(InputError, match="at least one"):
         write_results(tmp_path, [], {})
+
+
+@pytest.mark.parametrize(
+    ("counts", "expected"),
+    [
+        ([[3], [4]], {"0": 3, "1": 4}),
+        ([[4], [4]], {}),
+        ([[3], [3, 4]], {}),
+        ([[3], [4], [3, 4, 5]], {"0": 3, "1": 4}),
+    ],
+)
+def test_models_of_one_number_of_views_each_fill_one_column(counts, expected):
+    """A model that was trained with several numbers of views fills all columns."""
+    configs = {str(i): {"data": {"name": "thuman2"}, "views": views(*one)} for i, one in enumerate(counts)}
+    assert find_views_of_columns(configs) == expected
