@@ -1,12 +1,20 @@
 """Small data sets that all tests of a process share and do not change."""
 
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from scripts.miniatures import humman, zju_mocap
 from tests.helpers.captures import make_miniature
 from tests.helpers.people import render_boxes
+
+
+@pytest.fixture(autouse=True)
+def _roomy_disk(monkeypatch):
+    """Photographs are packed on disks with room only, whatever the disk of the tests has."""
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=100, free=50))
 
 
 @pytest.fixture(scope="session")
