@@ -207,6 +207,8 @@ CHANGES = {
     "opacities": Change(limit=7.0, rate=0.1),
     "colors": Change(limit=0.05, rate=0.001),
 }
+#: Weights of L1 and 1 - SSIM as in 3D Gaussian splatting, and of L1 of the silhouette.
+_WEIGHTS = (0.8, 0.2, 0.1)
 
 
 def start_scene(batch: Batch) -> Gaussians:
@@ -227,7 +229,7 @@ def per_scene(batch: Batch, renderer: Renderer, steps: int) -> Estimate:
         renderer: Renders input and target views.
         steps: Steps of the optimiser, at least 1.
     """
-    gaussians = Refinement(steps, renderer, CHANGES)(start_scene(batch), batch)
+    gaussians = Refinement(steps, renderer, CHANGES, _WEIGHTS)(start_scene(batch), batch)
     return Estimate(renderer(gaussians, batch.targets.cameras).image, gaussians=gaussians)
 
 
