@@ -37,7 +37,7 @@ NEAR = {
 }
 #: Weights of L1, 1 - SSIM and L1 of the silhouette.
 Weights = tuple[float, float, float]
-#: SSIM gains nothing here, and takes two thirds of the time.
+#: SSIM gains nothing here, and would take up to four fifths of the time.
 WEIGHTS: Weights = (1.0, 0.0, 0.3)
 
 

@@ -31,6 +31,8 @@ from ghgs_lit.geometry.masks import with_matte
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.method.heads.attributes import RawGaussians
 from ghgs_lit.metrics import psnr
+from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.refinement import refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, DepthMaps, Points, Targets
 from tests.helpers.scenes import CENTER, RADII, make_batch, painted_ellipsoid, with_soft_rims
@@ -250,6 +252,17 @@ def test_the_photographs_are_fitted():
     before, after = (psnr(i[0].clamp(0, 1), batch.targets.images[0]).item() for i in (begin, fitted.image))
     assert after > before + 8
     assert fitted.gaussians.splits == (int(batch.masks.sum()),)
+
+
+def test_only_gaussians_fitted_per_scene_compute_ssim(monkeypatch):
+    """Refinement of a prediction gains nothing from it; it would take most of the time."""
+    calls = []
+    monkeypatch.setattr(refinement, "ssim", lambda *a, **k: calls.append(1) or ssim(*a, **k))
+    batch = scene()
+    refinement.Refinement(2, RENDERER)(start_scene(batch), batch)
+    assert calls == []
+    per_scene(batch, RENDERER, steps=3)
+    assert calls == [1, 1, 1]
 
 
 def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
