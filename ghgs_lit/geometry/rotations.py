@@ -118,15 +118,14 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
         least: length below which the gradient, which grows as 1 / length, stays constant.
     """
     x = at_least_float32(x)
-    largest = torch.linalg.vector_norm(x.detach(), torch.inf, -1, keepdim=True)
-    is_zero = largest == 0
-    scaled = x / largest.masked_fill(is_zero, 1.0)
-    # The argument is replaced, not the result: a root at 0 would have an infinite gradient.
-    squared = scaled.square().sum(-1, keepdim=True).masked_fill(is_zero, 1.0)
-    direction = scaled * squared.rsqrt()
+    largest = x.detach().abs().amax(-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
+    scaled = x / largest
+    squared = scaled.square().sum(-1, keepdim=True)
+    # At least 1 unless x is 0, where a root would have an infinite gradient.
+    direction = scaled * squared.clamp(min=1).rsqrt()
     if not direction.requires_grad:
         return direction
-    direction = direction.masked_fill(is_zero, 0.0)
+    direction = direction.masked_fill(squared < 1, 0.0)
     if least == 0:
         return direction
     share = (largest * squared.detach().sqrt() / least).clamp(max=1)

@@ -95,8 +95,8 @@ class Exchange(nn.Module):
         """
         sent = self.tell(known)
         size = math.prod(windows.shape)
-        maps = sent.new_zeros(size + windows.spare, sent.shape[1]).index_copy(0, windows.place, sent)
+        maps = sent.new_zeros(size + windows.spare, sent.shape[1]).index_copy_(0, windows.place, sent)
         maps = self.across(maps[:size].view(*windows.shape, sent.shape[1]).permute(0, 3, 1, 2))
         place = windows.place.clamp(max=size - 1) if windows.spare else windows.place
         received = maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, place)
-        return known + self.hear(F.relu(received))
+        return known + self.hear(F.relu(received, inplace=True))

@@ -56,9 +56,10 @@ def slopes(
     )
     with exact(means.device.type), torch.enable_grad():
         drawn = render(shown, cameras)
-        wrong = (drawn.image - on_black(batch)).square().sum()
-        wrong = wrong + (drawn.alpha - coverage(batch)[:, :, None]).square().sum()
-        of_means, of_scales, of_opacities, of_colors = torch.autograd.grad(wrong / 2, leaves)
+        images = (drawn.image, drawn.alpha)
+        # Differences are the gradients of half the squared error.
+        wrong = (drawn.image.detach() - on_black(batch), drawn.alpha.detach() - coverage(batch)[:, :, None])
+        of_means, of_scales, of_opacities, of_colors = torch.autograd.grad(images, leaves, wrong)
     with torch.no_grad():
         of_means = of_means * footprints
         along = (of_means * directions).sum(-1, keepdim=True) / directions.norm(dim=-1, keepdim=True)
