@@ -56,10 +56,12 @@ def slopes(
     )
     with exact(means.device.type), torch.enable_grad():
         drawn = render(shown, cameras)
-        images = (drawn.image, drawn.alpha)
+        rendering = map_tensors(drawn, Tensor.detach)
         # Differences are the gradients of half the squared error.
-        wrong = (drawn.image.detach() - on_black(batch), drawn.alpha.detach() - coverage(batch)[:, :, None])
-        of_means, of_scales, of_opacities, of_colors = torch.autograd.grad(images, leaves, wrong)
+        wrong = (rendering.image - on_black(batch), rendering.alpha - coverage(batch)[:, :, None])
+        of_means, of_scales, of_opacities, of_colors = torch.autograd.grad(
+            (drawn.image, drawn.alpha), leaves, wrong
+        )
     with torch.no_grad():
         of_means = of_means * footprints
         along = (of_means * directions).sum(-1, keepdim=True) / directions.norm(dim=-1, keepdim=True)
@@ -67,8 +69,7 @@ def slopes(
         across = rotate(unit(inverse), of_means)
         logits = of_opacities * opacities * (1 - opacities)
         values = torch.cat((along, across, of_scales * scales, logits[:, None], of_colors), -1)
-        parts = (drawn.image.detach(), drawn.alpha.detach(), drawn.depth.detach())
-        return Rendering(*parts), torch.tanh(_STEEP * values)
+        return rendering, torch.tanh(_STEEP * values)
 
 
 @torch.no_grad()
