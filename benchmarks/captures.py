@@ -264,6 +264,8 @@ def main() -> None:
     parser.add_argument("--mend", action="store_true", help="what predict mends by itself, and nothing else")
     parser.add_argument("--first", type=int, default=0, help="with --mend: people before it take no part")
     options = parser.parse_args()
+    if not 0 <= options.first < options.people:
+        parser.error(f"--first: expected a person of --people {options.people}; found {options.first}")
     run = run_of("evaluate", ["data=synthetic", "metrics.lpips=off"])
     device = pick_device(run.device)
     size = options.size or trained_size(read_checkpoint(options.checkpoint)["config"])
